@@ -1,0 +1,1 @@
+"""The durable record of one procedure, the only thing the processes share."""

@@ -1,0 +1,1 @@
+"""C-STORE SCP, durable inbox, headers, assignment of slices to commanded shifts."""

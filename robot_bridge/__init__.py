@@ -1,0 +1,1 @@
+"""The daemon in the scanner room: wire protocol, motor drivers, emulated controller."""

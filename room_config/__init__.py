@@ -1,0 +1,1 @@
+"""The configuration of a room: one strict TOML file, units in the key names."""

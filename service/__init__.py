@@ -1,0 +1,1 @@
+"""The top: FastAPI app, web page, procedure, planner, kinematics, command line."""

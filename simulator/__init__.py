@@ -1,0 +1,1 @@
+"""A virtual room: phantom, scanner that pushes real DICOM, stage physics."""

@@ -1,0 +1,1 @@
+"""Numerics: localize the fiducial, reconstruct, simulate a slice. Only worker.py does I/O."""
