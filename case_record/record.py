@@ -154,7 +154,7 @@ class CaseRecord:
         return int(self._db.execute("SELECT COALESCE(MAX(event_id), 0) FROM event").fetchone()[0])
 
     def verify_events(self) -> int:
-        """Return how many events there are; CaseRecordError names the first that was tampered with."""
+        """Return the number of events; CaseRecordError names the first that was tampered with."""
         previous, number = _FIRST_HASH, 0
         for row in self._db.execute("SELECT * FROM event ORDER BY event_id"):
             number += 1
@@ -231,9 +231,7 @@ class CaseRecord:
         return [_hold(row) for row in rows]
 
     def next_set_id(self) -> int:
-        return int(
-            self._db.execute("SELECT COALESCE(MAX(set_id), 0) + 1 FROM hold").fetchone()[0]
-        )
+        return int(self._db.execute("SELECT COALESCE(MAX(set_id), 0) + 1 FROM hold").fetchone()[0])
 
     # Slices
 
@@ -362,8 +360,7 @@ class CaseRecord:
 
     def begin_procedure(self, name: str, arguments: Mapping[str, Any]) -> int:
         cursor = self._db.execute(
-            "INSERT INTO procedure (name, arguments, state, started_s)"
-            " VALUES (?, ?, 'running', ?)",
+            "INSERT INTO procedure (name, arguments, state, started_s) VALUES (?, ?, 'running', ?)",
             (name, _json(arguments), time.time()),
         )
         return int(cursor.lastrowid or 0)
@@ -382,9 +379,7 @@ class CaseRecord:
         rows = self._db.execute("SELECT * FROM procedure ORDER BY procedure_id")
         return [_procedure(row) for row in rows]
 
-    def send_step(
-        self, procedure_id: int, number: int, kind: str, body: Mapping[str, Any]
-    ) -> Step:
+    def send_step(self, procedure_id: int, number: int, kind: str, body: Mapping[str, Any]) -> Step:
         """Record that a step is about to be carried out, unless it already was recorded as sent."""
         with self.transaction():
             self._db.execute(

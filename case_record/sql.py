@@ -1,7 +1,7 @@
 """Every SQL statement that makes or changes the shape of a case record, oldest first.
 
 `MIGRATIONS[n]` brings a record from version n to n + 1; the version is SQLite's `user_version`.
-Set-valued columns (setpoints, covariances, headers) are JSON text: they are read whole, never searched.
+Set-valued columns (setpoints, covariances, headers) are JSON text: read whole, never searched.
 """
 
 MIGRATIONS: tuple[str, ...] = (

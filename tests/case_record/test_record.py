@@ -158,10 +158,14 @@ def test_a_second_running_procedure_is_refused(record):
 
 
 def test_a_failed_transaction_leaves_nothing_behind(record):
-    with pytest.raises(RuntimeError), record.transaction():
-        begin_hold(record)
-        record.append_event("moved", {}, source="test")
-        raise RuntimeError
+    def fail_half_way() -> None:
+        with record.transaction():
+            begin_hold(record)
+            record.append_event("moved", {}, source="test")
+            raise RuntimeError
+
+    with pytest.raises(RuntimeError):
+        fail_half_way()
     assert record.holds() == []
     assert record.last_event_id() == 0
 
@@ -175,9 +179,7 @@ def _append_many(case_dir: Path, source: str) -> None:
 def test_three_processes_append_at_once_and_the_chain_holds(record):
     version = record.data_version()
     spawn = multiprocessing.get_context("spawn")
-    writers = [
-        spawn.Process(target=_append_many, args=(record.case_dir, name)) for name in "abc"
-    ]
+    writers = [spawn.Process(target=_append_many, args=(record.case_dir, name)) for name in "abc"]
     for writer in writers:
         writer.start()
     for writer in writers:
