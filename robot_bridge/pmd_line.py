@@ -8,7 +8,7 @@ each, so that several axes move at once while `step` returns within its budget.
 import time
 from collections import deque
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 from robot_bridge.pmd_protocol import (
@@ -87,6 +87,7 @@ class _Transaction:
     deadline_s: float
     tries_left: int
     echo_due: bool  # a copy of our own bytes comes first
+    retried: bool
 
 
 class PmdLine:
@@ -95,7 +96,7 @@ class PmdLine:
     def __init__(
         self, port: Port, timeout_s: float, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._port, self._timeout_s, self._clock = port, timeout_s, clock
+        self._port, self.timeout_s, self._clock = port, timeout_s, clock
         self._reader = LineReader()
         self._tasks: deque[Task] = deque()
         self._current: _Transaction | None = None
@@ -175,8 +176,9 @@ class PmdLine:
     def _send(self, task: Task, command: Command, tries: int) -> None:
         self._port.reset_input_buffer()
         self._reader.clear()
-        deadline_s = self._clock() + self._timeout_s
-        self._current = _Transaction(task, command, deadline_s, tries - 1, self.own_echo)
+        deadline_s = self._clock() + self.timeout_s
+        retried = tries < TRIES and command.repeatable
+        self._current = _Transaction(task, command, deadline_s, tries - 1, self.own_echo, retried)
         self.transactions += 1
         self._port.write(command.line)
 
@@ -204,7 +206,7 @@ class PmdLine:
             self.chatter_lines += 1
             return
         self._current = None
-        self._resume(current.task, reply)
+        self._resume(current.task, replace(reply, retried=current.retried))
 
     def _timed_out(self, current: _Transaction) -> None:
         self._current = None
@@ -215,7 +217,7 @@ class PmdLine:
         said = f"; {self._reader.pending!r} came" if self._reader.pending else ""
         error = PmdTimeoutError(
             f"controller {current.command.address} did not answer '{current.command.text}' "
-            f"within {self._timeout_s * 1000:.0f} ms{said}"
+            f"within {self.timeout_s * 1000:.0f} ms{said}"
         )
         current.task.fail(error, self._clock())
         self._drop_if_done(current.task)

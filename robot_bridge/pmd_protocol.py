@@ -178,9 +178,13 @@ class LineReader:
 
 @dataclass(frozen=True)
 class Reply:
-    """A matched answer: the value behind the colon, or an empty text for an echo."""
+    """A matched answer: the value behind the colon, or an empty text for an echo.
+
+    retried: an earlier answer to the same command was lost (what it had latched went with it).
+    """
 
     value: str = ""
+    retried: bool = False
 
     def integer(self) -> int:
         """The leading integer; descriptions behind it (`1, Quad_32`) are ignored."""
