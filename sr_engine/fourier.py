@@ -178,7 +178,7 @@ def _penalty(shape: tuple[int, int], factor: int, count: int, prior: Prior) -> N
     else:
         gamma = np.ones((factor * shape[0], factor * shape[1]))
     # N/s^2 makes it lambda; one more 1/s^2 because the fine grid has s^2 as many frequencies.
-    scaled = (prior.strength * gamma + REGULARIZATION_FLOOR) * count / factor**4
+    scaled = np.maximum(prior.strength * gamma, REGULARIZATION_FLOOR) * count / factor**4
     return scaled.reshape(factor, shape[0], factor, shape[1])
 
 

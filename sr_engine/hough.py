@@ -93,7 +93,7 @@ def hough_circles(image: ArrayLike, settings: HoughSettings) -> list[Circle]:
     found = [
         _circle(accumulator, modulus, cut, where, settings)
         for where in _members(plateaus)
-        if cut[where[0][0], where[1][0]] >= height
+        if cut[where[0][0], where[1][0]] > 0.0
     ]
     return sorted(found, key=lambda circle: -circle.strength)
 
@@ -156,7 +156,7 @@ def _edges(image: Image, threshold: float | None) -> tuple[Image, Image]:
 def _radii(settings: HoughSettings) -> Image:
     low, high = settings.radius_px
     steps = math.floor((high - low) / settings.radius_step_px + 1e-9)
-    return low + settings.radius_step_px * np.arange(steps + 1)
+    return np.asarray(low + settings.radius_step_px * np.arange(steps + 1), dtype=np.float64)
 
 
 def _phase_of_radius(radii: Image, settings: HoughSettings) -> Image:
@@ -191,4 +191,8 @@ def _circle(
         weight = np.ones_like(weight)
     row, col = (float(np.average(index, weights=weight)) for index in where)
     phase = float(np.angle(accumulator[round(row), round(col)]))
-    return Circle((row, col), _radius_of_phase(phase, settings), float(cut[where][0]))
+    return Circle(
+        (row, col),
+        _radius_of_phase(phase, settings),
+        float(cut[where][0]) + 1.0 - settings.sensitivity,
+    )

@@ -146,7 +146,7 @@ def view_matrix(size: int, factor: int, shift_px: float, blur: Blur) -> sparse.c
 
 def _displacement(size: int, shift: float) -> sparse.csr_array:
     """Fine pixel j shows what was at j - shift (linear interpolation, border repeated)."""
-    return _interpolation(np.arange(size) - shift, size)
+    return _interpolation(np.arange(size, dtype=np.float64) - shift, size)
 
 
 def _interpolation(position: Image, size: int) -> sparse.csr_array:
@@ -179,9 +179,14 @@ def _sampling(size: int, factor: int, box: bool) -> sparse.csr_array:
 
 def _start(stack: Image, views: list[_View]) -> Image:
     """The frames put back where they came from, each fine pixel the mean of what saw it."""
-    total = sum(view.back(frame) for frame, view in zip(stack, views, strict=True))
-    weight = sum(view.back(np.ones_like(stack[0])) for view in views)
+    total = _back_projected(views, list(stack))
+    weight = _back_projected(views, [np.ones_like(frame) for frame in stack])
     return np.asarray(total / np.maximum(weight, 1e-12))
+
+
+def _back_projected(views: list[_View], residuals: list[Image]) -> Image:
+    """sum_k A_k^T r_k."""
+    return np.asarray(sum(view.back(r) for view, r in zip(views, residuals, strict=True)))
 
 
 def _descend(
@@ -193,8 +198,13 @@ def _descend(
 ) -> Descent:
     residuals = [view.forward(image) - seen for view, seen in zip(views, stack, strict=True)]
     history = [_mean_square(residuals)]
+    # Below the rounding of the frames themselves there is nothing left to explain.
+    rounding = 1e-30 * _mean_square(list(stack))
     while not (why := stopping.reason(len(history) - 1, history[-1], history[0])):
-        gradient = sum(view.back(res) for view, res in zip(views, residuals, strict=True))
+        if history[-1] <= rounding:
+            why = "rounding"
+            break
+        gradient = _back_projected(views, residuals)
         change = [view.forward(gradient) for view in views]
         curvature = sum(float(np.vdot(c, c)) for c in change)
         if curvature == 0.0:

@@ -136,7 +136,7 @@ def _fourier(
 ) -> NDArray[np.float64]:
     rows, cols = stack.shape[1:]
     if bridged:
-        stack = bridge(bridge(stack, axis=1), axis=2)
+        stack = bridge(bridge(stack, shifts, axis=1), shifts, axis=2)
     shape = (int(stack.shape[1]), int(stack.shape[2]))
     filters = prepare_filters(
         shape, shifts, factor, blur=blur, prior=prior, max_condition_number=max_condition_number
@@ -144,16 +144,20 @@ def _fourier(
     return filters.apply(stack)[: factor * rows, : factor * cols]
 
 
-def bridge(stack: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+def bridge(
+    stack: NDArray[np.float64], shifts: NDArray[np.float64], axis: int
+) -> NDArray[np.float64]:
     """``stack`` with pixels appended along ``axis`` that lead smoothly from its end to its start.
 
     What a Fourier transform takes for the neighbour of the last pixel is the first one; a step
-    between them would ring through the image.
+    between them would ring through the image. The bridge moves with the frames' shifts, as if
+    it stood in the scene; a bridge that contradicts the shifts would ring as well.
     """
     size = stack.shape[axis]
     added = int(fft.next_fast_len(size + 2 * MARGIN_PX, real=True)) - size
-    way = (np.arange(added) + 1) / (added + 1)
-    weight = (0.5 - 0.5 * np.cos(math.pi * way)).reshape([-1 if i == axis else 1 for i in range(3)])
+    way = (np.arange(added) + 1 - shifts[:, axis - 1 : axis]) / (added + 1)
+    weight = 0.5 - 0.5 * np.cos(math.pi * np.clip(way, 0.0, 1.0))
+    weight = weight[:, :, None] if axis == 1 else weight[:, None, :]
     last, first = (np.take(stack, [end], axis=axis) for end in (-1, 0))
     return np.concatenate([stack, last * (1 - weight) + first * weight], axis=axis)
 
