@@ -5,6 +5,7 @@ from inside `pump` and the calls that block (`open`, `move`, ...), never from a 
 `request_stop` alone may be called from any thread.
 """
 
+import contextlib
 import secrets
 import threading
 import time
@@ -150,20 +151,23 @@ class BridgeClient:
         deadman_s: float = 1.0,
         open_transport: Callable[[], Transport] | None = None,
         clock: Callable[[], float] = time.monotonic,
+        pause: Callable[[float], None] = time.sleep,
     ) -> None:
-        """`open_transport` and `clock` replace the serial line and the time (simulated rooms)."""
+        """`open_transport`, `clock` and `pause` replace the line and the time (virtual time)."""
         self._url = url
         self._name = name
         self._heartbeat_s = heartbeat_s
         self._deadman_s = deadman_s
         self._open_transport = open_transport or (lambda: SerialTransport(url, baud))
         self._clock = clock
+        self._pause = pause
         self._end = ServiceEnd()
         self._transport: Transport | None = None
         self._hello: messages.Hello | None = None
         self._status: messages.Status | None = None
         self._status_s = 0.0
-        self._heard_s = 0.0
+        self._answered_sequence = 0
+        self._waiting_since_s: float | None = None
         self._beat_s = 0.0
         self._hastily = False
         self._seen_ms = 0
@@ -190,7 +194,7 @@ class BridgeClient:
                 self._drop_transport()
                 if self._clock() >= until_s:
                     raise LinkLostError(f"{self._url}: no bridge answers: {error}") from error
-                time.sleep(HELLO_PAUSE_S)
+                self._pause(HELLO_PAUSE_S)
         hello = self._hello
         if hello.code != Code.OK:
             raise IncompatibleError(f"{self._url}: {hello.text}")
@@ -209,7 +213,8 @@ class BridgeClient:
             except TransportError as error:
                 raise LinkLostError(str(error)) from error
             self._end.forget_input()
-        self._heard_s = self._clock()
+        self._waiting_since_s = None
+        self._answered_sequence = 0
         self._end.say_hello(secrets.randbits(52), self._name, self._clock())
         self._flush()
 
@@ -242,7 +247,6 @@ class BridgeClient:
         """
         until_s = self._clock() + wait_s
         while True:
-            self._check_open()
             self._beat_if_due()
             left_s = until_s - self._clock()
             self._receive(min(max(left_s, 0.0), self._period_s() / 4))
@@ -278,8 +282,8 @@ class BridgeClient:
     def arm(self, by: str) -> None:
         """Allow motion. Refused while a stop is latched (then `rearm`) or a fault stands."""
         self._refuse_while_stopping()
-        stop_count = self.status.stop_count
-        self._ask(messages.Arm(by=by, stop_count=stop_count, seen_ms=self._seen_ms))
+        seen_ms, stop_count = self._seen(), self.status.stop_count
+        self._ask(messages.Arm(by=by, stop_count=stop_count, seen_ms=seen_ms))
 
     def disarm(self, by: str) -> None:
         """Forbid motion; a running one is stopped. Always accepted."""
@@ -288,21 +292,21 @@ class BridgeClient:
     def rearm(self, by: str) -> None:
         """Operator only: clear the latched stop that `status` shows, and arm. Phase: START_UP."""
         self._refuse_while_stopping()
-        stop_count = self.status.stop_count
-        self._ask(messages.Rearm(by=by, stop_count=stop_count, seen_ms=self._seen_ms))
+        seen_ms, stop_count = self._seen(), self.status.stop_count
+        self._ask(messages.Rearm(by=by, stop_count=stop_count, seen_ms=seen_ms))
 
     def set_phase(self, phase: WorkPhase, by: str) -> None:
         """Change the work phase as phases.ALLOWED allows; refused during a motion."""
-        self._ask(messages.SetPhase(phase=str(phase), by=by, seen_ms=self._seen_ms))
+        self._ask(messages.SetPhase(phase=str(phase), by=by, seen_ms=self._seen()))
 
     def set_insertion_lock(self, locked: bool, by: str) -> None:
         """Lock before READY, unlock when the needle is out. Locking stops a running motion."""
-        self._ask(messages.SetInsertionLock(locked=locked, by=by, seen_ms=self._seen_ms))
+        self._ask(messages.SetInsertionLock(locked=locked, by=by, seen_ms=self._seen()))
 
     def declare_position(self, positions_um: Mapping[str, int], by: str) -> None:
         """The robot stands at these positions (measured); positions are certain afterwards."""
         positions = _checked_um(positions_um)
-        self._ask(messages.DeclarePosition(positions_um=positions, by=by, seen_ms=self._seen_ms))
+        self._ask(messages.DeclarePosition(positions_um=positions, by=by, seen_ms=self._seen()))
         self._known_motion = self.status.last_motion
 
     def move(
@@ -335,13 +339,13 @@ class BridgeClient:
             setpoints_um=setpoints,
             measurement_id=measurement_id,
             based_on_motion=based_on,
-            seen_ms=self._seen_ms,
+            seen_ms=self._seen(),
         )
         return self._command(request, command_id, on_state)
 
     def home(self, command_id: str, by: str) -> MoveOutcome:
         """Search the axes' references; afterwards positions are certain. Blocks like `move`."""
-        request = messages.Home(command_id=command_id, by=by, seen_ms=self._seen_ms)
+        request = messages.Home(command_id=command_id, by=by, seen_ms=self._seen())
         return self._command(request, command_id, None)
 
     # --- STOP ---------------------------------------------------------------------------------
@@ -362,6 +366,12 @@ class BridgeClient:
         transport = self._transport
         if transport is not None:
             transport.write(encoded)
+            return
+        transport = self._open_transport()
+        try:
+            transport.write(encoded)
+        finally:
+            transport.close()
 
     def _refuse_while_stopping(self) -> None:
         if self._stopper.pending:
@@ -379,11 +389,9 @@ class BridgeClient:
             answer = self._request(request)
         except MessageError as error:
             return MoveOutcome(command_id, CommandState.REFUSED, Code.MALFORMED, str(error), {})
-        if answer.state is None:
-            state = CommandState.REFUSED
-        else:
-            state = CommandState(answer.state)
-        code, text, readback = answer.code, answer.text, answer.readback_um
+        state = CommandState(answer.state) if answer.state else CommandState.REFUSED
+        code, text = answer.code, answer.text
+        readback: Mapping[str, int] = answer.readback_um
         self._hastily = True
         try:
             self._refresh()
@@ -421,32 +429,45 @@ class BridgeClient:
             raise RefusedError(answer.code, answer.text)
 
     def _request(self, request: messages.Message) -> messages.Answer:
-        self._check_open()
+        self._check_session()
         self._answer = None
         self._end.send_request(request, self._clock())
+        self._wait_from_now()
         self._flush()
         while self._answer is None:
-            self._check_open()
             self._beat_if_due()
             self._receive(0.01)
         return self._answer
 
     def _refresh(self) -> None:
-        """Wait for a status that is newer than now."""
-        asked_s = self._clock()
-        self._beat()
-        while self._status is None or self._status_s < asked_s:
-            self._check_open()
+        """Wait for a status that the bridge made after now."""
+        wanted = self._beat()
+        while self._answered_sequence < wanted:
             if not self._end.awaits_answer(self._clock()):
                 self._beat()
             self._receive(0.01)
 
-    def _check_open(self) -> None:
+    def _seen(self) -> int:
+        """The newest bridge clock we saw, asked for again if it is not so new any more."""
+        self._check_session()
+        if self._clock() - self._status_s > min(self._heartbeat_s, self._deadman_s / 4):
+            self._refresh()
+        return self._seen_ms
+
+    def _check_session(self) -> None:
         if not self.is_open:
             raise LinkLostError(f"{self._url}: the session is not open")
-        silent_s = self._clock() - self._heard_s
+
+    def _check_heard(self, now_s: float) -> None:
+        if self._waiting_since_s is None or self._end.session is None:
+            return
+        silent_s = now_s - self._waiting_since_s
         if silent_s > self._deadman_s:
             self._lose(f"nothing heard from the bridge for {silent_s:.1f} s")
+
+    def _wait_from_now(self) -> None:
+        if self._waiting_since_s is None:
+            self._waiting_since_s = self._clock()
 
     def _lose(self, text: str) -> None:
         self._end.session = None
@@ -457,15 +478,21 @@ class BridgeClient:
         return min(self._heartbeat_s, MOTION_HEARTBEAT_S) if self._hastily else self._heartbeat_s
 
     def _beat_if_due(self) -> None:
+        self._check_session()
         now_s = self._clock()
-        due = now_s - self._beat_s >= self._period_s()
-        if due and not self._end.awaits_answer(now_s):
+        since_s, period_s = now_s - self._beat_s, self._period_s()
+        # While the bridge may be speaking, wait; but not for ever, it must hear from us.
+        patience_s = 2 * self._heartbeat_s if self._end.awaits_answer(now_s) else period_s
+        if since_s >= patience_s:
             self._beat()
 
-    def _beat(self) -> None:
+    def _beat(self) -> int:
+        self._check_session()
         self._beat_s = self._clock()
-        self._end.send_heartbeat(Heartbeat(seen_ms=self._seen_ms), self._beat_s)
+        sequence = self._end.send_heartbeat(Heartbeat(seen_ms=self._seen_ms), self._beat_s)
+        self._wait_from_now()
         self._flush()
+        return sequence
 
     def _flush(self) -> None:
         data = self._end.take_output()
@@ -488,19 +515,22 @@ class BridgeClient:
         for event in [*self._end.receive(data, now_s), *self._end.tick(now_s)]:
             self._act(event, now_s)
         self._flush()
+        self._check_heard(now_s)
 
     def _act(self, event: ServiceEvent, now_s: float) -> None:
         match event:
             case StopAcknowledged():
                 self._stopper.acknowledged(event.nonce)
+                self._beat_s = -1e9  # what the stop changed is wanted soon
             case HelloReceived():
-                self._heard_s = now_s
+                self._waiting_since_s = None
                 self._hello = event.hello
             case StatusReceived():
-                self._heard_s = now_s
+                self._waiting_since_s = None
+                self._answered_sequence = max(self._answered_sequence, event.sequence)
                 self._take_status(event.status, now_s)
             case Answered():
-                self._heard_s = now_s
+                self._waiting_since_s = None
                 self._answer = event.answer
             case SessionLost():
                 self._lose(
@@ -520,10 +550,9 @@ class BridgeClient:
     def _drop_transport(self) -> None:
         transport, self._transport = self._transport, None
         if transport is not None:
-            try:
+            # It may be gone already; then nothing is left to release.
+            with contextlib.suppress(TransportError):
                 transport.close()
-            except TransportError:
-                pass  # it is gone; nothing is left to release
 
 
 class _Stopper:
@@ -545,12 +574,12 @@ class _Stopper:
         with self._changed:
             if self._pending is not None:
                 emergency = emergency or self._pending[1]
-            self._pending = (secrets.randbits(32), emergency)
+            pending = self._pending = (secrets.randbits(32), emergency)
             if self._thread is None:
                 self._thread = threading.Thread(target=self._repeat, name="stop", daemon=True)
                 self._thread.start()
             self._changed.notify()
-        self._send(self._pending)
+        self._send(pending)
 
     def acknowledged(self, nonce: int) -> None:
         with self._changed:

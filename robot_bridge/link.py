@@ -183,6 +183,9 @@ class BridgeEnd:
 
     def open_session(self, opened: SessionOpened, hello: Callable[[int], Hello]) -> None:
         """End the old session, begin a new one and answer with `hello(session)`."""
+        if opened.request.nonce == self._nonce:  # twice in one read
+            self._send(self._hello)
+            return
         if self._nonce is not None:
             self._old_nonces.append(self._nonce)
         self.session = self._new_session()
@@ -221,7 +224,10 @@ class Answered:
 
 @dataclass(frozen=True)
 class StatusReceived:
+    """`sequence` is that of the heartbeat which it answers."""
+
     status: Status
+    sequence: int
 
 
 @dataclass(frozen=True)
@@ -342,7 +348,8 @@ class ServiceEnd:
     def abandon_request(self) -> None:
         self._request = None
 
-    def send_heartbeat(self, heartbeat: Heartbeat, now_s: float) -> None:
+    def send_heartbeat(self, heartbeat: Heartbeat, now_s: float) -> int:
+        """Ask for a status; the returned sequence number comes back with it."""
         assert self.session is not None
         self._heartbeat_sequence += 1
         frame = Frame(Heartbeat.KIND, self.session, self._heartbeat_sequence, pack(heartbeat))
@@ -351,6 +358,7 @@ class ServiceEnd:
             encoded, Heartbeat.KIND, self._heartbeat_sequence, now_s, 1, self.round_trip.timeout_s
         )
         self._send(encoded)
+        return self._heartbeat_sequence
 
     def tick(self, now_s: float) -> list[ServiceEvent]:
         """Send again what was not answered in time."""
@@ -395,7 +403,7 @@ class ServiceEnd:
             return [SessionLost(message.boot_id)]
         if isinstance(message, Status):
             self._land(self._heartbeat, frame.sequence, now_s)
-            return [StatusReceived(message)]
+            return [StatusReceived(message, frame.sequence)]
         if isinstance(message, Answer):
             return self._receive_answer(frame, message, now_s)
         return []
