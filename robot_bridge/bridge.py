@@ -53,7 +53,6 @@ class BridgeSettings:
     deadman_s: float = 1.0
     motion_timeout_s: float = 60.0
     motion_poll_s: float = 0.02
-    park_after_move: bool = False
     software: str = ""
 
 
@@ -64,7 +63,6 @@ class _Motion:
     record: CommandRecord
     accepted_s: float
     started: bool = False
-    parking: bool = False
     ending: tuple[CommandState, str, str] | None = None
     ending_s: float = 0.0
 
@@ -406,15 +404,8 @@ class Bridge:
         elif not status.reached:
             text = f"the motors ended at {_short(status)} without reaching the setpoints"
             self._finish(CommandState.FAILED, Code.NOT_REACHED, text)
-        elif self.settings.park_after_move and not status.parked:
-            self._park(motion)
         else:
             self._finish(CommandState.DONE, Code.OK, "")
-
-    def _park(self, motion: _Motion) -> None:
-        if not motion.parking:
-            motion.parking = True
-            self._park_motors()
 
     def _await_standstill(self, motion: _Motion, now_s: float) -> None:
         assert motion.ending is not None

@@ -214,7 +214,6 @@ def settings_of(config: BridgeConfig) -> BridgeSettings:
         deadman_s=config.deadman_s,
         motion_timeout_s=config.motion_timeout_s,
         motion_poll_s=config.motion_poll_s,
-        park_after_move=config.park_after_move,
         software=SOFTWARE,
     )
 
@@ -260,8 +259,8 @@ def run_bridge(
     make_guardian: Callable[[BridgeConfig], Guardian],
     *,
     exit_with_parent: bool = False,
-) -> None:
-    """The whole life of `python -m robot_bridge`. Raises StartError."""
+) -> str:
+    """The whole life of `python -m robot_bridge`; returns why it ended. Raises StartError."""
     guardian = make_guardian(config) if config.guardian else None
     try:
         daemon = _start(config, make_motors, guardian, exit_with_parent)
@@ -273,6 +272,7 @@ def run_bridge(
         signal.signal(number, lambda received, frame: daemon.leave(f"signal {received}"))
     log.info("ready", extra={"fields": {"boot_id": daemon.bridge.boot_id, "link": config.link}})
     daemon.run()
+    return daemon.exit_reason or ""
 
 
 def _start(
