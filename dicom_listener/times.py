@@ -69,11 +69,11 @@ def acquisition_interval(frame: FrameElements, times: TimeFrame) -> AcquisitionI
 
 
 def _frame_instants(frame: FrameElements, times: TimeFrame) -> tuple[float | None, float | None]:
-    found = []
-    for keyword in ("FrameReferenceDateTime", "FrameAcquisitionDateTime"):
-        text = frame.find("FrameContentSequence", lambda item, k=keyword: item.text(k))
-        found.append(_instant(text, frame.top, times) if text else None)
-    return found[0], found[1]
+    def instant(keyword: str) -> float | None:
+        text = frame.find("FrameContentSequence", lambda item: item.text(keyword))
+        return _instant(text, frame.top, times) if text else None
+
+    return instant("FrameReferenceDateTime"), instant("FrameAcquisitionDateTime")
 
 
 def _from(
@@ -195,7 +195,7 @@ def _epoch_s(local: datetime, zone: tzinfo | None, times: TimeFrame) -> float:
 
 
 def _instants_of_local(local: datetime, zone: tzinfo | None) -> Iterator[float]:
-    """Instants at which a wall clock in the zone shows `local`: one, two in autumn, none in spring."""
+    """When a clock in the zone shows `local`: once; twice in autumn, never in spring."""
     for fold in (0, 1):
         aware = local.replace(fold=fold, tzinfo=zone) if zone else local.replace(fold=fold)
         instant_s = aware.timestamp()
