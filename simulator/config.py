@@ -81,7 +81,11 @@ class StaticObject(_Table):
 
     @model_validator(mode="after")
     def _has_its_dimensions(self) -> "StaticObject":
-        wanted = {"box": {"size_mm"}, "sphere": {"radius_mm"}, "cylinder": {"radius_mm", "length_mm"}}
+        wanted = {
+            "box": {"size_mm"},
+            "sphere": {"radius_mm"},
+            "cylinder": {"radius_mm", "length_mm"},
+        }
         for key in ("size_mm", "radius_mm", "length_mm"):
             if (key in wanted[self.kind]) != (getattr(self, key) is not None):
                 raise ValueError(

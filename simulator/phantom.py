@@ -107,9 +107,7 @@ def _overlap(offset_mm: float, depth_mm: float, thickness_mm: float) -> float:
     return max(high - low, 0.0) / thickness_mm
 
 
-def _chords(
-    radius_mm: float, offset_mm: float, thickness_mm: float
-) -> list[tuple[float, float]]:
+def _chords(radius_mm: float, offset_mm: float, thickness_mm: float) -> list[tuple[float, float]]:
     """Widths at which the layers of a slab cut a lying cylinder, and the share of each layer."""
     low = max(offset_mm - thickness_mm / 2, -radius_mm)
     high = min(offset_mm + thickness_mm / 2, radius_mm)

@@ -56,9 +56,7 @@ def fiducial_in_robot_mm(
     top = np.array([stage_mm["xt"], stage_mm["yt"], placement.top_plane_mm])
     if fiducial.mount == "top_stage":
         return top + np.array(fiducial.offset_mm)
-    bottom = np.array(
-        [stage_mm.get("xb", 0.0), stage_mm.get("yb", 0.0), placement.bottom_plane_mm]
-    )
+    bottom = np.array([stage_mm.get("xb", 0.0), stage_mm.get("yb", 0.0), placement.bottom_plane_mm])
     guide = top - bottom
     return bottom + fiducial.along_guide_mm * guide / np.linalg.norm(guide)
 
