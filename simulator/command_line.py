@@ -1,6 +1,8 @@
 """`autospine scanner`: the virtual scanner as a process."""
 
+import contextlib
 import json
+import os
 import signal
 import sys
 import threading
@@ -59,8 +61,10 @@ def _stop_event(exit_with_parent: bool) -> threading.Event:
 
 
 def _stop_at_end_of_input(stop: threading.Event) -> None:
-    while sys.stdin.buffer.read(4096):
-        pass
+    # Not sys.stdin: a thread inside of its lock would break the interpreter's own exit.
+    with contextlib.suppress(OSError):
+        while os.read(0, 4096):
+            pass
     stop.set()
 
 

@@ -27,7 +27,7 @@ class _Table(BaseModel):
 
 
 class Placement(_Table):
-    """How the robot stands on the patient table: patient = origin + rotation · skew · scale · robot."""
+    """How the robot stands on the table, and how true its stages are."""
 
     origin_mm: Vector = (5.3, 58.0, -17.6)
     rotation_deg: Annotated[float, Field(gt=-180, le=180)] = 1.5
@@ -120,7 +120,7 @@ class SliceProtocol(_Table):
     fov_centre_mm: Vector = (5.0, 58.0, -18.0)
     """Patient position of the middle of the field of view of the slice at its default position."""
     phase_encoding: Literal["ROW", "COL"] = "COL"
-    """DICOM's word: COL means that the phase is encoded along the columns, the readout along rows."""
+    """DICOM's word: COL encodes the phase along the columns and reads out along the rows."""
     window: Literal["flat", "hamming", "fermi", "elliptical"] = "flat"
     """The filter in k-space."""
     snr: Positive = 30.0

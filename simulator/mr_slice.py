@@ -27,7 +27,6 @@ _PLANES = {
     "sagittal": ((0.0, 0.0, -1.0), (0.0, 1.0, 0.0)),
 }
 _STILL_MM = 1e-7
-_HZ_PER_PPM_MHZ = 1.0  # 1 ppm of 1 MHz is 1 Hz
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,7 +143,7 @@ def slice_geometry(
 
 def chemical_shift_px(protocol: SliceProtocol) -> Floats:
     """Displacement (row, col) of oil against water, along the readout."""
-    hz = protocol.chemical_shift_ppm * protocol.imaging_frequency_mhz * _HZ_PER_PPM_MHZ
+    hz = protocol.chemical_shift_ppm * protocol.imaging_frequency_mhz  # 1 ppm of 1 MHz is 1 Hz
     along_readout = protocol.readout_polarity * hz / protocol.bandwidth_hz_px
     readout_axis = 1 if protocol.phase_encoding == "COL" else 0
     return along_readout * np.eye(2)[readout_axis]

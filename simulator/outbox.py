@@ -14,7 +14,7 @@ from pydicom.dataset import Dataset
 from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
 from pynetdicom import AE
 from pynetdicom.association import Association
-from pynetdicom.sop_class import EnhancedMRImageStorage, MRImageStorage  # type: ignore[attr-defined]
+from pynetdicom.sop_class import EnhancedMRImageStorage, MRImageStorage
 
 from simulator.config import ScannerSettings
 

@@ -22,8 +22,8 @@ _SLAB_NODES = 24
 
 def frequencies(shape: Shape, spacing_mm: Spacing) -> tuple[Floats, Floats]:
     """Sampled frequencies along rows (rows, 1) and columns (1, cols), cycles/mm."""
-    along_rows = np.fft.fftfreq(shape[0], spacing_mm[0])
-    along_cols = np.fft.fftfreq(shape[1], spacing_mm[1])
+    along_rows = np.asarray(np.fft.fftfreq(shape[0], spacing_mm[0]), dtype=np.float64)
+    along_cols = np.asarray(np.fft.fftfreq(shape[1], spacing_mm[1]), dtype=np.float64)
     return along_rows[:, None], along_cols[None, :]
 
 

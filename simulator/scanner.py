@@ -113,7 +113,6 @@ class VirtualScanner:
 
     def serve(self, request: AcquisitionRequest, stop: threading.Event) -> None:
         """Acquire the slices that were asked for, one series; raises TruthError."""
-        self._series += 1
         series = self._new_series("fl2d_cor_guide", ("M", "ND", "NORM"))
         for index in range(request.count):
             if index:
@@ -127,7 +126,6 @@ class VirtualScanner:
         """Acquire without having been asked if the robot is just moving; whether it did so."""
         if not ask_where(self._address).moving or not self._strikes("motion_during_scan"):
             return False
-        self._series += 1
         scan = self._scan(None, 0, stop, frozenset({"motion_during_scan"}))
         self._send(scan, self._new_series("fl2d_cor_guide", ("M", "ND", "NORM")))
         return True
@@ -313,7 +311,6 @@ def operate(room: VirtualRoom, stop: threading.Event, note: Note) -> None:
             note(f"{delivery.sop_instance_uid} could not be delivered: {delivery.reason}")
 
     served: set[str] = set()
-    scanned_this_motion = False
     with httpx.Client(timeout=2.0, trust_env=False) as http, Outbox(settings, report) as outbox:
         scanner = VirtualScanner(room, truth, outbox, say)
         while not stop.wait(settings.poll_s):
@@ -326,12 +323,10 @@ def operate(room: VirtualRoom, stop: threading.Event, note: Note) -> None:
                     scanner.scan_if_moving(stop)
                 scanner.release_held_back()
                 say("")
-            except (httpx.HTTPError, ValueError, TruthError) as error:
-                say(
-                    f"{settings.service_url}: {error}"
-                    if not isinstance(error, TruthError)
-                    else str(error)
-                )
+            except TruthError as error:
+                say(str(error))
+            except (httpx.HTTPError, ValueError) as error:
+                say(f"{settings.service_url}: {error}")
     truth.close()
 
 

@@ -27,13 +27,10 @@ class Affine:
 
 
 def patient_from_robot(placement: Placement) -> Affine:
-    """The placement as an affine map, robot mm to patient LPS mm; the planes stay `z` of the robot."""
-    skew = np.radians(placement.skew_deg)
-    axes = np.array([[1.0, np.sin(skew), 0.0], [0.0, np.cos(skew), 0.0], [0.0, 0.0, 1.0]])
+    """How the robot stands: a rigid map, robot mm to patient LPS mm."""
     in_plane = _rotation(2, placement.rotation_deg)
     tilt = _rotation(0, placement.tilt_deg[0]) @ _rotation(2, placement.tilt_deg[1])
-    linear = tilt @ _NOMINAL @ in_plane @ axes @ np.diag([*placement.scale, 1.0])
-    return Affine(linear, np.array(placement.origin_mm))
+    return Affine(tilt @ _NOMINAL @ in_plane, np.array(placement.origin_mm))
 
 
 def _rotation(axis: int, angle_deg: float) -> Floats:
@@ -53,12 +50,20 @@ def fiducial_in_robot_mm(
     The cannula is fixed in the lower ball joint and slides in the upper one, so a fiducial on the
     guide stays at its distance from the lower joint whatever the guide's angle.
     """
-    top = np.array([stage_mm["xt"], stage_mm["yt"], placement.top_plane_mm])
+    top = _ball_joint_mm(placement, stage_mm["xt"], stage_mm["yt"], placement.top_plane_mm)
     if fiducial.mount == "top_stage":
         return top + np.array(fiducial.offset_mm)
-    bottom = np.array([stage_mm.get("xb", 0.0), stage_mm.get("yb", 0.0), placement.bottom_plane_mm])
+    xb, yb = stage_mm.get("xb", 0.0), stage_mm.get("yb", 0.0)
+    bottom = _ball_joint_mm(placement, xb, yb, placement.bottom_plane_mm)
     guide = top - bottom
     return bottom + fiducial.along_guide_mm * guide / np.linalg.norm(guide)
+
+
+def _ball_joint_mm(placement: Placement, x_mm: float, y_mm: float, plane_mm: float) -> Floats:
+    """Robot frame; x and y are on the stages' own scales, whose axes are not quite square."""
+    skew = np.radians(placement.skew_deg)
+    along_x, along_y = placement.scale[0] * x_mm, placement.scale[1] * y_mm
+    return np.array([along_x + np.sin(skew) * along_y, np.cos(skew) * along_y, plane_mm])
 
 
 def true_fiducials_mm(room: VirtualRoom, stage_mm: Mapping[str, float]) -> dict[str, Floats]:

@@ -46,7 +46,8 @@ def ask_where(address: TruthAddress) -> StageTruth:
     """Where the stages stand now. Raises TruthError."""
     answer = _ask(address, "where")
     try:
-        positions = {str(axis): float(mm) for axis, mm in answer["positions_mm"].items()}
+        stages = answer["positions_mm"]
+        positions = {axis: float(stages[axis]) for axis in _checked_axes(stages)}
         return StageTruth(float(answer["t"]), positions, bool(answer["moving"]))
     except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise TruthError(f"truth at {address}: 'where' was answered with {answer!r}") from error
@@ -57,7 +58,7 @@ def ask_path(address: TruthAddress, from_s: float, until_s: float) -> StagePath:
     answer = _ask(address, f"history {from_s:.6f} {until_s:.6f}")
     try:
         samples = answer["samples"]
-        axes = tuple(samples[0]["positions_mm"])
+        axes = _checked_axes(samples[0]["positions_mm"])
         times = np.array([float(sample["t"]) for sample in samples])
         positions = np.array(
             [[float(sample["positions_mm"][axis]) for axis in axes] for sample in samples]
@@ -67,6 +68,13 @@ def ask_path(address: TruthAddress, from_s: float, until_s: float) -> StagePath:
     if not (np.all(np.isfinite(positions)) and np.all(np.diff(times) >= 0)):
         raise TruthError(f"truth at {address}: history is not in order or not finite")
     return StagePath(axes, times, positions)
+
+
+def _checked_axes(positions: dict[str, Any]) -> tuple[str, ...]:
+    """The names of the axes; without the top stage there is no fiducial. Raises KeyError."""
+    for axis in ("xt", "yt"):
+        positions[axis]
+    return tuple(positions)
 
 
 def _ask(address: TruthAddress, question: str) -> Any:
