@@ -31,7 +31,7 @@ _STILL_MM = 1e-7
 
 @dataclass(frozen=True, eq=False)
 class StagePath:
-    """True stage positions over time, linear between samples and constant outside of them.
+    """True stage positions over time: each sample holds until the next one.
 
     times_s (n,), increasing; positions_mm (n, axes), columns in the order of `axes`.
     """
@@ -47,11 +47,8 @@ class StagePath:
 
     def at(self, time_s: float) -> dict[str, float]:
         """Axis → position in mm."""
-        columns = self.positions_mm.T
-        return {
-            axis: float(np.interp(time_s, self.times_s, column))
-            for axis, column in zip(self.axes, columns, strict=True)
-        }
+        last = max(int(np.searchsorted(self.times_s, time_s, side="right")) - 1, 0)
+        return dict(zip(self.axes, self.positions_mm[last].tolist(), strict=True))
 
     @property
     def travel_mm(self) -> float:

@@ -1,8 +1,9 @@
 """Asks the emulated motor controllers where the stages truly are (loopback TCP, a line each way).
 
-`where` answers `{"t", "positions_mm": {axis: mm}, "moving"}`; `history T0 T1` answers
-`{"samples": [{"t", "positions_mm"}, …]}`: the positions at T0, at every change, and at T1.
-Instants are seconds since the epoch, UTC.
+`where` answers `{"t", "positions_mm": {axis: mm}, "moving", …}`; `history T0 T1` answers
+`{"start_mm": {axis: mm}, "samples": [[t, {axis: mm}], …], …}`: where the stages stood at T0, and
+each change until T1. What cannot be answered is `{"error": text}`. Instants are seconds since the
+epoch, UTC.
 """
 
 import json
@@ -57,13 +58,11 @@ def ask_path(address: TruthAddress, from_s: float, until_s: float) -> StagePath:
     """The path that the stages took between two instants. Raises TruthError."""
     answer = _ask(address, f"history {from_s:.6f} {until_s:.6f}")
     try:
-        samples = answer["samples"]
-        axes = _checked_axes(samples[0]["positions_mm"])
-        times = np.array([float(sample["t"]) for sample in samples])
-        positions = np.array(
-            [[float(sample["positions_mm"][axis]) for axis in axes] for sample in samples]
-        )
-    except (KeyError, TypeError, ValueError, IndexError) as error:
+        axes = _checked_axes(answer["start_mm"])
+        samples = [(from_s, answer["start_mm"]), *answer["samples"]]
+        times = np.array([float(time_s) for time_s, _ in samples])
+        positions = np.array([[float(stages[axis]) for axis in axes] for _, stages in samples])
+    except (KeyError, TypeError, ValueError) as error:
         raise TruthError(f"truth at {address}: 'history' was answered with {answer!r}") from error
     if not (np.all(np.isfinite(positions)) and np.all(np.diff(times) >= 0)):
         raise TruthError(f"truth at {address}: history is not in order or not finite")
@@ -86,9 +85,12 @@ def _ask(address: TruthAddress, question: str) -> Any:
     except OSError as error:
         raise TruthError(f"truth at {address}: {error}") from error
     try:
-        return json.loads(answer)
+        decoded = json.loads(answer)
     except ValueError as error:
         raise TruthError(f"truth at {address}: {question!r} was not answered in JSON") from error
+    if isinstance(decoded, dict) and "error" in decoded:
+        raise TruthError(f"truth at {address}: {decoded['error']}")
+    return decoded
 
 
 def _read_line(line: socket.socket) -> bytes:

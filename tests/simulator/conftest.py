@@ -44,9 +44,12 @@ class Stages:
                 moving = self.times_s[0] <= now < self.times_s[-1]
                 return {"t": now, "positions_mm": self.at(now), "moving": moving}
             case ["history", first, last]:
-                between = [t for t in self.times_s if float(first) < t < float(last)]
-                times = [float(first), *between, float(last)]
-                return {"samples": [{"t": t, "positions_mm": self.at(t)} for t in times]}
+                begin = max(float(first), self.times_s[0])
+                end = min(float(last), self.times_s[-1])
+                count = max(round((end - begin) / 0.002), 0)
+                times = [begin + (end - begin) * (n + 1) / count for n in range(count)]
+                samples = [[t, self.at(t)] for t in times]
+                return {"start_mm": self.at(float(first)), "samples": samples}
         return {"error": f"not understood: {question}"}
 
 

@@ -125,7 +125,8 @@ def test_oil_is_displaced_along_the_readout_and_water_is_not() -> None:
 
 def test_a_slice_taken_while_the_robot_moves_is_smeared_and_one_taken_after_is_not() -> None:
     room = quiet_room()
-    path = StagePath(("xt", "yt"), np.array([10.0, 10.2]), np.array([[0.0, 0.0], [0.0, 3.0]]))
+    times_s = np.linspace(10.0, 10.2, 201)
+    path = StagePath(("xt", "yt"), times_s, np.outer((times_s - 10.0) / 0.2, [0.0, 3.0]))
     rng = np.random.default_rng(0)
     during = acquire(room, path, rng, interval_s=(10.0, 10.2))
     after = acquire(room, path, rng, interval_s=(10.2, 10.4))
