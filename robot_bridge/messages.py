@@ -243,7 +243,7 @@ class Status(Message):
 
 @dataclass(frozen=True)
 class Answer(Message):
-    """To every request but HelloRequest and Heartbeat. For a command, `state` says how it stands."""
+    """To every request but the first two kinds. `state` says how a command stands."""
 
     KIND = 0x83
     code: str
@@ -365,11 +365,13 @@ def schema_text() -> str:
     """One line a message: type byte, name, fields in order with their types."""
     lines = [f"protocol {PROTOCOL_VERSION}"]
     for kind, cls in sorted(MESSAGES.items()):
-        columns = ", ".join(
-            f"{field.name}: {getattr(field.type, '__name__', field.type)}" for field in fields(cls)
-        )
+        columns = ", ".join(f"{field.name}: {_type_name(field.type)}" for field in fields(cls))
         lines.append(f"0x{kind:02x} {cls.__name__}({columns})")
     return "\n".join(lines)
+
+
+def _type_name(kind: Any) -> str:
+    return kind.__name__ if isinstance(kind, type) else str(kind)
 
 
 SCHEMA_HASH = hashlib.sha256(schema_text().encode()).digest()[:8]
