@@ -1,0 +1,33 @@
+"""`[imaging]`: what a usable slice looks like, and the fiducial in it."""
+
+from pydantic import Field, model_validator
+
+from room_config.section import Section
+
+
+class ImagingConfig(Section):
+    coronal_tolerance_deg: float = Field(
+        default=10.0, gt=0, le=45, description="Largest angle between slice normal and ±y (LPS)."
+    )
+    fiducial_radius_min_mm: float = Field(
+        default=2.5, gt=0, description="Smallest radius at which the fiducial may appear."
+    )
+    fiducial_radius_max_mm: float = Field(
+        default=6.5, gt=0, description="Largest radius at which the fiducial may appear."
+    )
+    start_region_px: tuple[float, float, float, float] | None = Field(
+        default=None,
+        description="Row and column bounds (r0, c0, r1, c1) in which the fiducial is looked for "
+        "while nothing is known of its position; absent: the whole slice.",
+    )
+    position_gate_mm: float = Field(
+        default=3.0,
+        gt=0,
+        description="A fiducial further than this from its predicted position is not believed.",
+    )
+
+    @model_validator(mode="after")
+    def _ordered(self) -> "ImagingConfig":
+        if not self.fiducial_radius_min_mm < self.fiducial_radius_max_mm:
+            raise ValueError("fiducial_radius_min_mm must be below fiducial_radius_max_mm")
+        return self

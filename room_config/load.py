@@ -1,0 +1,99 @@
+"""Read the configuration of a room: one strict TOML file, environment variables over it.
+
+`AUTOSPINE_LISTENER__PORT=11112` overrides `port` in `[listener]`. An unknown, missing or misspelt
+key is a `ConfigError` whose one line names the file and the key.
+"""
+
+from __future__ import annotations
+
+import difflib
+import os
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from room_config.imaging import ImagingConfig
+from room_config.listener import ListenerConfig
+from room_config.room import RoomConfig
+from room_config.service import ServiceConfig
+from room_config.worker import WorkerConfig
+
+ENVIRONMENT_PREFIX = "AUTOSPINE_"
+
+
+class ConfigError(Exception):
+    """The configuration cannot be used; the text is one line that names file and key."""
+
+    exit_code = 2
+
+
+class Config(BaseModel):
+    """The whole file. `[bridge]` and `[virtual]` are checked by those who own them."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    room: RoomConfig
+    imaging: ImagingConfig = Field(default_factory=ImagingConfig)
+    listener: ListenerConfig = Field(default_factory=ListenerConfig)
+    worker: WorkerConfig = Field(default_factory=WorkerConfig)
+    service: ServiceConfig
+    bridge: dict[str, Any] = Field(default_factory=dict)
+    virtual: dict[str, Any] = Field(default_factory=dict)
+
+
+def load_config(path: Path, environment: Mapping[str, str] = os.environ) -> Config:
+    """Return the checked configuration in `path`; relative folders are relative to that file."""
+    table = read_toml(path)
+    _override(table, environment)
+    try:
+        config = Config.model_validate(table)
+    except ValidationError as error:
+        raise ConfigError(f"{path}: {_first_error(error)}") from None
+    case_dir = (path.parent / config.room.case_dir).resolve()
+    return config.model_copy(update={"room": config.room.model_copy(update={"case_dir": case_dir})})
+
+
+def read_toml(path: Path) -> dict[str, Any]:
+    """Return the tables of a TOML file, or say in one line why it cannot be read."""
+    try:
+        return tomllib.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ConfigError(f"{path}: cannot be read ({error.strerror})") from None
+    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
+        raise ConfigError(f"{path}: not valid TOML ({error})") from None
+
+
+def _override(table: dict[str, Any], environment: Mapping[str, str]) -> None:
+    for name, value in environment.items():
+        if not name.startswith(ENVIRONMENT_PREFIX) or "__" not in name:
+            continue
+        section, key = name.removeprefix(ENVIRONMENT_PREFIX).lower().split("__", 1)
+        table.setdefault(section, {})[key] = value
+
+
+def _first_error(error: ValidationError) -> str:
+    first = error.errors()[0]
+    place = [str(part) for part in first["loc"]]
+    key = ".".join(place)
+    if first["type"] == "extra_forbidden":
+        close = difflib.get_close_matches(place[-1], _known_keys(place[:-1]), n=1)
+        hint = f" (did you mean {close[0]!r}?)" if close else ""
+        return f"unknown key {key}{hint}"
+    if first["type"] == "missing":
+        return f"missing key {key}"
+    return f"key {key}: {first['msg']}, got {first['input']!r}"
+
+
+def _known_keys(place: list[str]) -> list[str]:
+    model: Any = Config
+    for part in place:
+        field = model.model_fields.get(part)
+        if field is None or not isinstance(field.annotation, type):
+            return []
+        if not issubclass(field.annotation, BaseModel):
+            return []
+        model = field.annotation
+    return list(model.model_fields)
