@@ -27,6 +27,7 @@ from sr_engine.localize import Localization, localize
 from sr_engine.reconstruct import reconstruct
 
 IMAGES = "images"
+ALIVE = "worker.alive"
 _SAME_PLACE = 1e-6
 _NEAR_PX = 3.0
 log = structlog.get_logger()
@@ -54,9 +55,14 @@ class Frames:
 
 
 def serve(config: Config, should_stop: Callable[[], bool]) -> None:
-    """Work until `should_stop`; looks for requests every `poll_s`."""
+    """Work until `should_stop`; looks for requests every `poll_s`, says every second: alive."""
+    alive = config.room.case_dir / ALIVE
+    said_s = 0.0
     with CaseRecord(config.room.case_dir, create=True) as record:
         while not should_stop():
+            if time.monotonic() - said_s > 1.0:
+                alive.touch()
+                said_s = time.monotonic()
             for request in record.requested_measurements():
                 measure(record, request, config.worker.reconstruction_factor)
             time.sleep(config.worker.poll_s)
@@ -167,9 +173,7 @@ def _localize(frames: Frames, request: Measurement) -> Localization:
     radius_px = (low_mm / spacing, high_mm / spacing)
     expected_mm = request.request["expected_plane_mm"]
     if expected_mm is None:
-        return localize(
-            frames.pixels, frames.shifts_px, radius_px=radius_px, method=request.method
-        )
+        return localize(frames.pixels, frames.shifts_px, radius_px=radius_px, method=request.method)
     origin = _plane_origin_mm(frames.geometry)
     expected_px = (np.array(expected_mm) - origin) / np.array(frames.geometry.spacing_mm)
     gate_px = float(request.request["gate_mm"]) / spacing
