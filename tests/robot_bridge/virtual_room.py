@@ -100,7 +100,7 @@ class VirtualRoom:
     def rearmed_s(self) -> list[float]:
         """When re-armings were carried out, read from the journal's file."""
         lines = (self._folder / FILE_NAME).read_text().splitlines()
-        entries = (json.loads(line[9:]) for line in lines if '"rearm"' in line)
+        entries = (json.loads(line[9:]) for line in lines if '"kind":"rearm"' in line)
         return [entry["t"] for entry in entries]
 
     # --- time ---------------------------------------------------------------------------------
@@ -137,6 +137,7 @@ class VirtualRoom:
             open_transport=lambda: VirtualTransport(self),
             clock=self.clock,
             pause=self.run,
+            random_bits=self.rng.getrandbits,
             stop_thread=False,
             **settings,  # type: ignore[arg-type]
         )
