@@ -188,6 +188,29 @@ class PmdMotors:
         for name, axis in self._axes.items():
             self._other[name] = self._line_of(axis).start(axis.park(), f"parking of {name}")
 
+    def run_steps(self, name: str, steps: int) -> None:
+        """Begin an open-loop run of waveform steps, forward positive, of one axis (calibration).
+
+        For an engineer at the controller: the bridge never calls it, it moves in setpoints alone.
+        Raises MotorError if the run could leave the travel even with steps twice as long as set.
+        """
+        self._require_ready()
+        axis = self._axis(name)
+        _check_run(axis, steps)
+        self._begin()
+        self._setpoints_um = {}
+        procedure = axis.run_steps(steps)
+        self._motion[name] = self._line_of(axis).start(procedure, f"run of {name}")
+
+    def measure_um(self, name: str) -> float:
+        """The encoder's position, asked for now. Raises MotorError."""
+        self._require_ready()
+        axis = self._axis(name)
+        if not axis.closed_loop:
+            raise MotorError("no_encoder", f"axis {name} runs in open loop")
+        self._run(axis, axis.measure(), "measurement", self._clock() + DECLARE_DEADLINE_S)
+        return axis.position_um
+
     def declare_position(self, positions_um: Mapping[str, int]) -> None:
         self._require_ready()
         axes = {name: self._axis(name) for name in positions_um}
@@ -370,6 +393,21 @@ def _check_setpoint(axis: AxisConfig, setpoint_um: int) -> None:
             "beyond_travel",
             f"axis {axis.name}: setpoint {setpoint_um!r} um is outside "
             f"{axis.travel_min_um}..{axis.travel_max_um} um",
+        )
+
+
+def _check_run(axis: PmdAxis, steps: int) -> None:
+    config = axis.config
+    if not isinstance(steps, int) or steps == 0:
+        raise MotorError("bad_run", f"axis {config.name}: a run of {steps!r} steps")
+    reach_um = 2 * abs(steps) * max(config.step_um_forward, config.step_um_reverse)
+    direction = config.sign * (1 if steps > 0 else -1)
+    end_um = axis.readback_um() + direction * reach_um
+    if not config.travel_min_um <= end_um <= config.travel_max_um:
+        raise MotorError(
+            "beyond_travel",
+            f"axis {config.name}: {steps:+d} steps could reach {end_um:.0f} um, outside "
+            f"{config.travel_min_um}..{config.travel_max_um} um",
         )
 
 

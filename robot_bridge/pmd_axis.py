@@ -356,6 +356,17 @@ class PmdAxis:
                 self.certain = False
                 self._run = None
 
+    def run_steps(self, steps: int) -> Procedure:
+        """A run of whole waveform steps whatever they amount to; the encoder, if any, tells."""
+        self.fault = None
+        yield from self.unpark()
+        yield from self.run_open_loop(steps * MICROSTEPS_PER_STEP)
+        yield from self._read_position()
+        self._at_rest_um = self.position_um
+
+    def measure(self) -> Procedure:
+        yield from self._read_position_surely()
+
     def _begin_run(self, run: _Run, phase: int, expected_phase: int) -> Steps[None]:
         """Start the run once. If that answer is lost, find out; never start it again.
 

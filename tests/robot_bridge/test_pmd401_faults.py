@@ -391,5 +391,5 @@ def noisy_moves(seed: int, drive: str = "open_loop") -> None:
             if status.reached and status.certain:
                 assert made.position_um(1) == pytest.approx(setpoint_um, abs=2)
             else:
-                assert status.fault is not None
+                assert status.fault is not None or not status.certain
         motors.close()
