@@ -250,12 +250,13 @@ class Campaign:
         if not stops:
             return
         # The last stop frame that reached the bridge needs a re-arming carried out after it, and
-        # the last stop that was new (not a repetition) an operator who called after it.
+        # the last stop that was new (not a repetition) an operator who called after it. Equal
+        # times are in that order: a frame arrives within a step, an operator calls after one.
         first_s: dict[int, float] = {}
         for stop in stops:
             first_s.setdefault(stop.nonce, stop.at_s)
         carried_out_s = max((s for s in self._rearmed_s if s <= at_s), default=-1.0)
-        obeyed = carried_out_s >= stops[-1].at_s and armed_s > max(first_s.values())
+        obeyed = carried_out_s >= stops[-1].at_s and armed_s >= max(first_s.values())
         findings.moves_after_stop += not obeyed
 
     def _judge_agreement(self) -> None:
