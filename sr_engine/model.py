@@ -99,3 +99,89 @@ def image_of(
     across = np.cos(2 * np.pi * np.outer(rows - centre_px[0], space.k_row))
     along = np.cos(2 * np.pi * np.outer(cols - centre_px[1], space.k_col))
     return np.asarray(across @ (spectrum * space.weight) @ along.T)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What the round object is: a disc, or a sphere cut by a slab (z_offset, thickness) in px."""
+
+    slab_px: tuple[float, float] | None = None
+
+    def spectrum(self, k_abs: Array, radius_px: float) -> Array:
+        if self.slab_px is None:
+            return disc_spectrum(k_abs, radius_px)
+        return sphere_slab_spectrum(k_abs, radius_px, self.slab_px)
+
+
+DISC = Shape()
+_RADIUS_STEP = 0.125  # between expansion points; third order then errs by 1e-6 of the peak
+
+
+@lru_cache(maxsize=96)
+def _expansion(
+    period: tuple[int, int], psf: Psf, shape: Shape, radius_px: float
+) -> tuple[Array, Array, Array, Array]:
+    """Weighted spectrum at radius_px and its Taylor coefficients in the radius."""
+    space = k_space(period, psf)
+    k, w = space.k_abs, space.weight
+    if shape.slab_px is not None:
+        h = _RADIUS_STEP / 2
+        low, mid, high = (shape.spectrum(k, radius_px + d) * w for d in (-h, 0.0, h))
+        return mid, (high - low) / (2 * h), (high - 2 * mid + low) / (2 * h * h), np.zeros_like(w)
+    q = 2 * np.pi * k
+    b0, b1 = j0(q * radius_px), j1(q * radius_px)
+    first = 2 * np.pi * radius_px * b0
+    second = 2 * np.pi * (b0 - q * radius_px * b1)
+    third = -2 * np.pi * q * (b1 + q * radius_px * b0)
+    zeroth = disc_spectrum(k, radius_px)
+    return zeroth * w, first * w, second * w / 2, third * w / 6
+
+
+def spectrum_near(
+    period: tuple[int, int], psf: Psf, shape: Shape, radius_px: float
+) -> tuple[Array, Array]:
+    """Weighted spectrum and its derivative in the radius, from the nearest cached expansion."""
+    base = max(round(radius_px / _RADIUS_STEP), 1) * _RADIUS_STEP
+    d = radius_px - base
+    c0, c1, c2, c3 = _expansion(period, psf, shape, base)
+    return c0 + d * (c1 + d * (c2 + d * c3)), c1 + d * (2 * c2 + 3 * d * c3)
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """A rectangle of consecutive pixels of a frame, and the period of that frame."""
+
+    rows: Array
+    cols: Array
+    period: tuple[int, int]
+
+
+@lru_cache(maxsize=32)
+def _waves(n: int, period: tuple[int, int], psf: Psf, axis: int) -> tuple[Array, Array, Array]:
+    """cos and sin of 2 pi k x at x = 0..n-1 (n, K), and 2 pi k (K,), along one axis."""
+    space = k_space(period, psf)
+    q = 2 * np.pi * (space.k_row if axis == 0 else space.k_col)
+    angle = np.outer(np.arange(n), q)
+    return np.cos(angle), np.sin(angle), q
+
+
+def _displaced_waves(
+    pixels: Array, period: tuple[int, int], psf: Psf, axis: int, centre_px: float
+) -> tuple[Array, Array]:
+    """cos of q (x - centre) at consecutive pixels, and its derivative in the centre: (n, K)."""
+    first = int(pixels[0])
+    cos, sin, q = _waves(len(pixels), period, psf, axis)
+    away = q * (centre_px - first)
+    cos_away, sin_away = np.cos(away), np.sin(away)
+    return cos * cos_away + sin * sin_away, sin * (q * cos_away) - cos * (q * sin_away)
+
+
+def unit_object(
+    patch: Patch, psf: Psf, shape: Shape, centre_px: tuple[float, float], radius_px: float
+) -> tuple[Array, Array, Array, Array]:
+    """Image of a unit object on the patch, and its derivatives by row, column and radius."""
+    spectrum, by_radius = spectrum_near(patch.period, psf, shape, radius_px)
+    row, d_row = _displaced_waves(patch.rows, patch.period, psf, 0, centre_px[0])
+    col, d_col = _displaced_waves(patch.cols, patch.period, psf, 1, centre_px[1])
+    half = spectrum @ col.T
+    return row @ half, d_row @ half, row @ (spectrum @ d_col.T), row @ (by_radius @ col.T)

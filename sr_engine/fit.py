@@ -1,0 +1,308 @@
+"""Maximum-likelihood fit of one round object in one frame, with its covariance.
+
+The pixels have the Rician mean and variance that belong to the signal of `signal` (or Gaussian
+ones, from a camera). Noise that passed a k-space filter is coloured and is whitened with the
+correlation that the filter gives it. Levenberg-Marquardt with analytic derivatives, in rounds: each
+takes the weights, the noise level and the mask of odd pixels from the fit before it.
+"""
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.linalg import solve_triangular
+
+from sr_engine.errors import NotConvergedError
+from sr_engine.model import DISC, Shape, unit_object
+from sr_engine.noise import NoiseKind, colour_factor, is_white, moments, sigma_of
+from sr_engine.psf import Psf
+from sr_engine.signal import (
+    AMPLITUDE,
+    BACKGROUND,
+    N_PARAMETERS,
+    RADIUS,
+    SURROUNDINGS,
+    Mask,
+    ObjectModel,
+    Pixels,
+    prior_precision,
+    signal_of,
+)
+
+Array = NDArray[np.float64]
+
+_OUTLIER_SIGMA = 4.5
+_OUTLIER_NEIGHBOUR_SIGMA = 2.5
+_MAX_ITERATIONS = 60
+_MAX_ROUNDS = 8
+_SAME_SIGMA = 0.1  # relative change of the noise level that leaves the weights as they are
+_SETTLED = 1e-4  # expected change of chi2, so a step of 0.01 sigma in any parameter
+
+
+@dataclass(frozen=True, eq=False)
+class DiscFit:
+    """The fit of one frame. `parameters` in the order of `signal`'s constants."""
+
+    parameters: Array
+    covariance: Array  # of all parameters; what noise and prior leave uncertain
+    sigma: float  # noise std per channel, from the residuals unless it was given
+    chi2_per_dof: float
+    n_pixels: int
+    n_masked: int
+    explained: float  # chi2 that the object takes away, against background and slopes alone
+
+    @property
+    def centre_px(self) -> Array:
+        return self.parameters[:2]
+
+    @property
+    def covariance_px2(self) -> Array:
+        return self.covariance[:2, :2]
+
+    @property
+    def radius_px(self) -> float:
+        return float(self.parameters[RADIUS])
+
+    @property
+    def amplitude(self) -> float:
+        return float(self.parameters[AMPLITUDE])
+
+    @property
+    def background(self) -> float:
+        return float(self.parameters[BACKGROUND])
+
+    @property
+    def snr(self) -> float:
+        return abs(self.amplitude) / self.sigma
+
+    def moved_to(self, centre_px: Array) -> "DiscFit":
+        """The same object elsewhere: where to start in the next frame."""
+        return replace(self, parameters=np.concatenate([centre_px, self.parameters[2:]]))
+
+
+@dataclass(frozen=True, eq=False)
+class _Problem:
+    pixels: Pixels
+    model: ObjectModel
+    noise: NoiseKind
+    radius_bounds_px: tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class _Metric:
+    """How residuals are weighed during one round: fixed, so that chi2 is one function."""
+
+    sigma: float
+    weights: Array  # (n,) one over the std of each pixel
+    colour: Array | None  # lower Cholesky factor of the correlation of the pixels' noise
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """chi2 around one set of parameters."""
+
+    signal: Array  # (rows, cols)
+    residual: Array  # (n,) whitened
+    jacobian: Array  # (n, 9) whitened
+    information: Array  # (9, 9)
+    bend: Array  # (9, 9) what the curvature of the Rician mean adds to the information
+
+
+def fit_disc(
+    pixels: Pixels,
+    start: tuple[float, float, float] | DiscFit,
+    psf: Psf,
+    *,
+    radius_bounds_px: tuple[float, float],
+    shape: Shape = DISC,
+    noise: NoiseKind = "rician",
+    sigma: float | None = None,
+    robust: bool = True,
+) -> DiscFit:
+    """Fit the object that starts at (row, col, radius), or like another fit.
+
+    sigma: noise std per channel where it is known; otherwise it is taken from the residuals.
+    robust: leave out pixels that disagree with any round object (a bubble, a neighbour).
+    Raises NotConvergedError when the fit does not settle or leaves radius_bounds_px.
+    """
+    begin = start.parameters[:2] if isinstance(start, DiscFit) else np.array(start[:2])
+    reference = (float(np.round(begin[0])), float(np.round(begin[1])))
+    problem = _Problem(pixels, ObjectModel(psf, shape, reference), noise, radius_bounds_px)
+    if isinstance(start, DiscFit):
+        parameters, level = start.parameters.copy(), start.sigma
+    else:
+        parameters, level = _linear_start(problem, start)
+    level = level if sigma is None else sigma
+    signal, _ = signal_of(parameters, pixels.patch, problem.model)
+    for _ in range(_MAX_ROUNDS):
+        metric = _metric(problem, signal, level)
+        parameters, at = _levenberg_marquardt(problem, parameters, metric)
+        mask = _without_outliers(problem, pixels.mask, at, metric, sigma) if robust else pixels.mask
+        old = level
+        if sigma is None:
+            level = _next_sigma(problem, mask, at, level, float(abs(parameters[AMPLITUDE])))
+        same = np.array_equal(mask, problem.pixels.mask) and abs(level / old - 1) < _SAME_SIGMA
+        if same:
+            break
+        problem, signal = replace(problem, pixels=replace(pixels, mask=mask)), at.signal
+    return _summary(problem, parameters, at, level, metric.sigma / level)
+
+
+def _linear_start(problem: _Problem, start: tuple[float, float, float]) -> tuple[Array, float]:
+    """Parameters with amplitude and background by least squares, and a noise level to begin at."""
+    parameters = np.zeros(N_PARAMETERS)
+    parameters[:2] = start[:2]
+    parameters[RADIUS] = np.clip(start[2], *problem.radius_bounds_px)
+    model, mask = problem.model, problem.pixels.mask
+    centre, radius = (start[0], start[1]), float(parameters[RADIUS])
+    s, *_ = unit_object(problem.pixels.patch, model.psf, model.shape, centre, radius)
+    basis = np.stack([s[mask], np.ones(int(mask.sum()))], axis=1)
+    values = problem.pixels.values[mask]
+    solution, *_ = np.linalg.lstsq(basis, values, rcond=None)
+    if solution[0] == 0:
+        raise NotConvergedError("no contrast at the start position")
+    parameters[[AMPLITUDE, BACKGROUND]] = solution
+    misfit = float(1.4826 * np.median(np.abs(values - np.abs(basis @ solution))))
+    return parameters, max(misfit, 1e-9 * float(np.ptp(values)))
+
+
+def _next_sigma(
+    problem: _Problem, mask: Mask, at: _Linearised, sigma: float, amplitude: float
+) -> float:
+    values = problem.pixels.values[mask]
+    new = sigma_of(values, at.signal[mask], sigma, problem.noise, N_PARAMETERS)
+    return max(new, 1e-9 * amplitude)
+
+
+def _without_outliers(
+    problem: _Problem, mask: Mask, at: _Linearised, metric: _Metric, known_sigma: float | None
+) -> Mask:
+    """The mask without pixels that no round object explains, and without their odd neighbours."""
+    expected = moments(at.signal, metric.sigma, problem.noise)
+    size = np.abs(problem.pixels.values - expected.mean) / np.sqrt(expected.variance)
+    spread = 1.4826 * float(np.median(size[mask]))
+    spread = max(spread, 1.0) if known_sigma is not None else max(spread, 1e-12)
+    out = mask & (size > _OUTLIER_SIGMA * spread)
+    if not out.any():
+        return mask
+    padded = np.pad(out, 1)
+    rows, cols = out.shape
+    near = np.zeros_like(out)
+    for i in range(3):
+        for j in range(3):
+            near |= padded[i : i + rows, j : j + cols]
+    keep = mask & ~out & ~(near & (size > _OUTLIER_NEIGHBOUR_SIGMA * spread))
+    return keep if keep.sum() > 0.5 * mask.sum() else mask
+
+
+def _metric(problem: _Problem, signal: Array, sigma: float) -> _Metric:
+    mask, psf = problem.pixels.mask, problem.model.psf
+    expected = moments(signal[mask], sigma, problem.noise)
+    colour = None
+    if not is_white(psf):
+        colour = colour_factor(problem.pixels.patch.period, psf, mask, expected, sigma)
+    return _Metric(sigma, 1 / np.sqrt(expected.variance), colour)
+
+
+def _linearise(problem: _Problem, parameters: Array, metric: _Metric) -> _Linearised:
+    signal, derivatives = signal_of(parameters, problem.pixels.patch, problem.model)
+    mask = problem.pixels.mask
+    by_parameter = derivatives[:, mask]
+    expected = moments(signal[mask], metric.sigma, problem.noise)
+    residual = (problem.pixels.values[mask] - expected.mean) * metric.weights
+    jacobian = (by_parameter * (expected.slope * metric.weights)).T
+    force = residual
+    if metric.colour is not None:
+        both = np.column_stack([residual, jacobian])
+        both = solve_triangular(metric.colour, both, lower=True, check_finite=False)
+        residual, jacobian = both[:, 0], both[:, 1:]
+        force = solve_triangular(metric.colour, residual, lower=True, trans="T", check_finite=False)
+    bend = -(by_parameter * (force * metric.weights * expected.curvature)) @ by_parameter.T
+    return _Linearised(signal, residual, jacobian, jacobian.T @ jacobian, bend)
+
+
+def _levenberg_marquardt(
+    problem: _Problem, parameters: Array, metric: _Metric
+) -> tuple[Array, _Linearised]:
+    """Minimise chi2 + prior in one metric."""
+    damping: float = 1e-3
+    at = _linearise(problem, parameters, metric)
+    precision = prior_precision(parameters)
+    low, high = problem.radius_bounds_px
+    for _ in range(_MAX_ITERATIONS):
+        gradient = at.jacobian.T @ at.residual - precision * parameters
+        cost = float(at.residual @ at.residual + precision @ parameters**2)
+        step = _damped_step(at, precision, gradient, damping)
+        if gradient @ step < _SETTLED * max(1.0, cost / at.residual.size):
+            return parameters + step, at
+        moved = parameters + step
+        moved[RADIUS] = np.clip(moved[RADIUS], low, high)
+        there = _linearise(problem, moved, metric)
+        if there.residual @ there.residual + precision @ moved**2 <= cost * (1 + 1e-12):
+            parameters, at = moved, there
+            damping = max(damping / 30, 1e-9)
+        elif damping > 1e8:
+            return parameters, at  # no direction improves: as far down as rounding allows
+        else:
+            damping *= 10
+    raise NotConvergedError(f"the fit did not settle in {_MAX_ITERATIONS} iterations")
+
+
+def _damped_step(at: _Linearised, precision: Array, gradient: Array, damping: float) -> Array:
+    """Newton's step where the Hessian is positive, the Gauss-Newton step elsewhere, damped."""
+    gauss_newton = at.information + np.diag(precision)
+    damper = np.diag(damping * np.diag(gauss_newton))
+    hessian = gauss_newton + at.bend + damper
+    try:
+        np.linalg.cholesky(hessian)
+    except np.linalg.LinAlgError:
+        hessian = gauss_newton + damper
+    return np.asarray(np.linalg.solve(hessian, gradient))
+
+
+def _summary(
+    problem: _Problem, parameters: Array, at: _Linearised, sigma: float, scale: float
+) -> DiscFit:
+    """The fit as the last round left it; scale: that round's noise level over the final one."""
+    low, high = problem.radius_bounds_px
+    if not low < parameters[RADIUS] < high:
+        raise NotConvergedError(
+            f"the radius ran to the end of its range, {parameters[RADIUS]:.2f} px in "
+            f"[{low:.2f}, {high:.2f}]"
+        )
+    at = replace(
+        at,
+        residual=at.residual * scale,
+        jacobian=at.jacobian * scale,
+        information=at.information * scale**2,
+    )
+    n = at.residual.size
+    return DiscFit(
+        parameters=parameters,
+        covariance=_covariance(at, parameters),
+        sigma=sigma,
+        chi2_per_dof=float(at.residual @ at.residual) / max(n - N_PARAMETERS, 1),
+        n_pixels=n,
+        n_masked=int(np.count_nonzero(~problem.pixels.mask)),
+        explained=_explained(at, parameters),
+    )
+
+
+def _covariance(at: _Linearised, parameters: Array) -> Array:
+    """Mean squared error of the estimate: what the noise does to it, and the pull of the prior.
+
+    The pull is judged by the estimate itself, so this is right for an object without shading as
+    for one with it, which the inverse of information plus prior is not.
+    """
+    precision = prior_precision(parameters)
+    inverse = np.linalg.inv(at.information + np.diag(precision))
+    pull = inverse @ (precision * parameters)
+    return np.asarray(inverse @ at.information @ inverse + np.outer(pull, pull))
+
+
+def _explained(at: _Linearised, parameters: Array) -> float:
+    """Growth of chi2 if the object were not there, background and slopes adapting (linearised)."""
+    target = at.residual + at.jacobian[:, AMPLITUDE] * parameters[AMPLITUDE]
+    basis, _ = np.linalg.qr(at.jacobian[:, SURROUNDINGS])
+    left = target - basis @ (basis.T @ target)
+    return float(left @ left - at.residual @ at.residual)
