@@ -32,9 +32,8 @@ def scanner(
         room = _virtual_room(config)
         assert room.scanner is not None
         stop = _stop_event(exit_with_parent)
-        ready = {"ready": "scanner", "truth_file": str(Path(room.scanner.truth_file).resolve())}
-        print(json.dumps(ready), flush=True)
-        operate(room, stop, _note)
+        ready = {"ready": "scanner", "truth_file": room.scanner.truth_file}
+        operate(room, stop, _note, lambda: print(json.dumps(ready), flush=True))
     except (ConfigError, VirtualRoomError) as error:
         print(error, file=sys.stderr)
         raise typer.Exit(BAD_INPUT) from None
@@ -47,7 +46,10 @@ def _virtual_room(path: Path) -> VirtualRoom:
         raise VirtualRoomError(f"{path}: {error}") from None
     if room.scanner is None:
         raise VirtualRoomError(f"{path}: virtual.scanner: missing table")
-    return room
+    # Relative to the configuration, as every path in it.
+    truth_file = str((path.parent / room.scanner.truth_file).resolve())
+    scanner = room.scanner.model_copy(update={"truth_file": truth_file})
+    return room.model_copy(update={"scanner": scanner})
 
 
 def _stop_event(exit_with_parent: bool) -> threading.Event:
