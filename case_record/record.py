@@ -38,6 +38,8 @@ _BUSY_TIMEOUT_S = 10.0
 class CaseRecordError(Exception):
     """The case directory cannot be used; the text says why and names it."""
 
+    exit_code = 2
+
 
 class CaseRecord:
     """One connection to the record of a case. Use it in the thread that opened it."""
@@ -149,6 +151,13 @@ class CaseRecord:
             "SELECT * FROM event WHERE event_id > ? ORDER BY event_id LIMIT ?", (after_id, limit)
         )
         return [Event(**{**row, "body": json.loads(row["body"])}) for row in map(dict, rows)]
+
+    def last_event(self, kind: str) -> Event | None:
+        """Return the newest event of a kind."""
+        row = self._db.execute(
+            "SELECT * FROM event WHERE kind = ? ORDER BY event_id DESC LIMIT 1", (kind,)
+        ).fetchone()
+        return Event(**{**dict(row), "body": json.loads(row["body"])}) if row else None
 
     def last_event_id(self) -> int:
         return int(self._db.execute("SELECT COALESCE(MAX(event_id), 0) FROM event").fetchone()[0])
@@ -304,6 +313,12 @@ class CaseRecord:
         ).fetchone()
         return _slice(row) if row else None
 
+    def count_slices_after(self, slice_id: int, state: str) -> int:
+        row = self._db.execute(
+            "SELECT COUNT(*) FROM slice WHERE slice_id > ? AND state = ?", (slice_id, state)
+        ).fetchone()
+        return int(row[0])
+
     def count_slices(self) -> dict[str, int]:
         rows = self._db.execute("SELECT state, COUNT(*) AS n FROM slice GROUP BY state")
         return {row["state"]: row["n"] for row in rows}
@@ -348,6 +363,15 @@ class CaseRecord:
             raise CaseRecordError(f"{self.case_dir}: there is no measurement {measurement_id}")
         return _measurement(row)
 
+    def last_measurement(self, state: str | None = None) -> Measurement | None:
+        """Return the newest measurement; without a state the newest that is not just requested."""
+        row = self._db.execute(
+            "SELECT * FROM measurement WHERE state = COALESCE(?, state) AND state != 'requested'"
+            " ORDER BY measurement_id DESC LIMIT 1",
+            (state,),
+        ).fetchone()
+        return _measurement(row) if row else None
+
     def measurements(self, state: str | None = None) -> list[Measurement]:
         where = "state = ?" if state else "1"
         rows = self._db.execute(
@@ -373,6 +397,14 @@ class CaseRecord:
 
     def running_procedure(self) -> Procedure | None:
         row = self._db.execute("SELECT * FROM procedure WHERE state = 'running'").fetchone()
+        return _procedure(row) if row else None
+
+    def last_procedure(self, name: str, state: str) -> Procedure | None:
+        row = self._db.execute(
+            "SELECT * FROM procedure WHERE name = ? AND state = ?"
+            " ORDER BY procedure_id DESC LIMIT 1",
+            (name, state),
+        ).fetchone()
         return _procedure(row) if row else None
 
     def procedures(self) -> list[Procedure]:

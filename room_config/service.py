@@ -43,12 +43,15 @@ class ServiceConfig(Section):
     prediction_gate_sigma: float = Field(
         default=5.0, gt=0, description="Refuse to go on when a move misses its prediction by more."
     )
+    rescan_after_s: float = Field(
+        default=60.0, gt=0, description="Ask for the slices again when none came for so long."
+    )
     repeatability_um: float = Field(
         default=14.0, gt=0, description="Standard deviation of one axis after one move."
     )
     step_scale_error: float = Field(
-        default=0.05,
+        default=0.015,
         gt=0,
         lt=1,
-        description="Relative uncertainty of a move's length before it was measured.",
+        description="Relative scatter of a move's length from one move to the next.",
     )

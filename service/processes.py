@@ -1,0 +1,89 @@
+"""`autospine service` and `autospine worker`: one process each."""
+
+from __future__ import annotations
+
+import json
+import signal
+import socket
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import Annotated
+
+import structlog
+import typer
+import uvicorn
+
+from room_config.load import Config, ConfigError, load_config
+from service.logs import configure_logs
+
+ConfigOption = Annotated[Path, typer.Option("--config", help="The room's TOML file.")]
+ParentOption = Annotated[
+    bool, typer.Option("--exit-with-parent", help="End when standard input is closed.")
+]
+_LOOPBACK = ("127.0.0.1", "::1", "localhost")
+
+
+def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> None:
+    """Page, API, procedure, planner."""
+    from service.app import create_app
+
+    configure_logs()
+    room = load_config(config)
+    listening = bind(room)
+    host, port = listening.getsockname()[:2]
+    url = f"http://{host}:{port}"
+    app = create_app(room, announce=lambda: announce({"url": url}))
+    server = uvicorn.Server(
+        uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=1)
+    )
+    if exit_with_parent:
+        on_parent_gone(lambda: setattr(server, "should_exit", True))
+    server.run(sockets=[listening])
+
+
+def worker(config: ConfigOption, exit_with_parent: ParentOption = False) -> None:
+    """Localize and reconstruct."""
+    from sr_engine.worker import serve
+
+    configure_logs()
+    room = load_config(config)
+    stop = threading.Event()
+    for number in (signal.SIGINT, signal.SIGTERM):
+        signal.signal(number, lambda *_: stop.set())
+    if exit_with_parent:
+        on_parent_gone(stop.set)
+    announce({})
+    serve(room, stop.is_set)
+
+
+def bind(room: Config) -> socket.socket:
+    """Return the listening socket of the page; ConfigError if that cannot be."""
+    host, port = room.service.host, room.service.port
+    if host not in _LOOPBACK:
+        raise ConfigError(f"key service.host: {host} is not loopback; tokens are needed for that")
+    listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
+    listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listening.bind((host, port))
+    except OSError as error:
+        listening.close()
+        raise ConfigError(f"service port {host}:{port}: {error.strerror}") from None
+    return listening
+
+
+def announce(facts: dict[str, object]) -> None:
+    """Print the one line by which a supervisor knows that the process is ready."""
+    print(json.dumps({"ready": True, **facts}), flush=True)
+
+
+def on_parent_gone(end: Callable[[], object]) -> None:
+    """Call `end` when standard input is closed: whoever started this process is no more."""
+
+    def wait() -> None:
+        sys.stdin.buffer.read()
+        structlog.get_logger().info("the parent process is gone: ending")
+        end()
+
+    threading.Thread(target=wait, name="parent", daemon=True).start()

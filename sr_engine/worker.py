@@ -1,0 +1,213 @@
+"""The worker process: takes requested measurements from the case record, localizes, writes back.
+
+The only module of the engine that does I/O. It never raises over an image: what cannot be measured
+is recorded as failed, with the reason.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import structlog
+from dicom_listener.pixels import PixelError, magnitude_pixels
+from numpy.typing import NDArray
+
+from case_record.record import CaseRecord
+from case_record.rows import Measurement, SliceRow
+from room_config.load import Config
+from sr_engine.errors import EngineError, SingularShiftSetError
+from sr_engine.geometry import SliceGeometry
+from sr_engine.localize import Localization, localize
+from sr_engine.reconstruct import reconstruct
+
+IMAGES = "images"
+_SAME_PLACE = 1e-6
+log = structlog.get_logger()
+
+
+class UnusableSlicesError(Exception):
+    """The slices of a measurement do not belong together, or cannot be read."""
+
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+@dataclass(frozen=True, eq=False)
+class Frames:
+    """What a measurement is made from: frames of one geometry, and their known shifts.
+
+    pixels: (N, rows, cols); shifts_px: (N, 2), displacement from the reference pose.
+    """
+
+    pixels: NDArray[np.float64]
+    shifts_px: NDArray[np.float64]
+    geometry: SliceGeometry
+    slices: tuple[SliceRow, ...]
+
+
+def serve(config: Config, should_stop: Callable[[], bool]) -> None:
+    """Work until `should_stop`; looks for requests every `poll_s`."""
+    with CaseRecord(config.room.case_dir, create=True) as record:
+        while not should_stop():
+            for request in record.requested_measurements():
+                measure(record, request, config.worker.reconstruction_factor)
+            time.sleep(config.worker.poll_s)
+
+
+def measure(record: CaseRecord, request: Measurement, factor: int) -> None:
+    """Carry out one requested measurement and record its result, or why there is none."""
+    number = request.measurement_id
+    try:
+        frames = gather_frames(record, request)
+        found = _localize(frames, request)
+        result = describe_result(frames, found)
+        result["reconstruction"] = _reconstruction(record.case_dir, number, frames, factor)
+    except (EngineError, UnusableSlicesError, PixelError) as error:
+        code = getattr(error, "code", None) or getattr(error, "reason", "unusable")
+        with record.transaction():
+            record.fail_measurement(number, str(code), str(error))
+            record.append_event(
+                "measurement_failed",
+                {"measurement_id": number, "reason": str(error)},
+                source="worker",
+            )
+        log.warning("measurement failed", measurement_id=number, reason=str(error))
+        return
+    with record.transaction():
+        record.finish_measurement(number, result)
+        record.append_event(
+            "measurement_done",
+            {"measurement_id": number, "patient_mm": result["patient_mm"]},
+            source="worker",
+        )
+
+
+def gather_frames(record: CaseRecord, request: Measurement) -> Frames:
+    """Read every assigned slice of the request's holds; all must share one geometry."""
+    pixels: list[NDArray[np.float64]] = []
+    shifts_mm: list[tuple[float, float]] = []
+    slices: list[SliceRow] = []
+    for hold in request.request["holds"]:
+        for row in record.slices(hold_id=hold["hold_id"], state="assigned"):
+            pixels.append(magnitude_pixels(record.case_dir / row.path, row.frame))
+            shifts_mm.append(tuple(hold["shift_mm"]))
+            slices.append(row)
+    if not slices:
+        raise UnusableSlicesError("no_slices", "no slice is assigned to the holds")
+    geometry = _common_geometry(slices)
+    shifts_px = np.array(shifts_mm, dtype=float) / np.array(geometry.spacing_mm)
+    return Frames(np.array(pixels), shifts_px, geometry, tuple(slices))
+
+
+def geometry_of(header: Mapping[str, Any]) -> SliceGeometry:
+    """Return the slice geometry from the header as the record keeps it."""
+    geometry = header["geometry"]
+    return SliceGeometry(
+        position_mm=tuple(geometry["position_mm"]),
+        row_direction=tuple(geometry["row_direction"]),
+        col_direction=tuple(geometry["col_direction"]),
+        spacing_mm=tuple(geometry["spacing_mm"]),
+        shape=tuple(geometry["shape"]),
+    )
+
+
+def describe_result(frames: Frames, found: Localization) -> dict[str, Any]:
+    """Return what the record keeps of a localization, JSON-ready; see `case_record.rows`."""
+    geometry = frames.geometry
+    spacing = np.array(geometry.spacing_mm)
+    covariance = np.asarray(found.covariance_px2)
+    centre = np.asarray(found.centre_px)
+    # the newest slice is what the page shows: say where the fiducial is in that one
+    shown_px = centre + frames.shifts_px[-1]
+    return {
+        "slice_id": frames.slices[-1].slice_id,
+        "slice_ids": [row.slice_id for row in frames.slices],
+        "centre_px": shown_px.tolist(),
+        "reference_px": centre.tolist(),
+        "sigma_px": np.sqrt(np.diag(covariance)).tolist(),
+        "covariance_px2": covariance.tolist(),
+        "radius_px": float(found.radius_px),
+        "snr": float(found.snr),
+        "chi2_per_dof": float(found.chi2_per_dof),
+        "residuals_px": np.asarray(found.residuals_px).tolist(),
+        "method": found.method,
+        "n_frames": int(found.n_frames),
+        "patient_mm": geometry.patient_from_pixel(centre).tolist(),
+        "plane_mm": (_plane_origin_mm(geometry) + centre * spacing).tolist(),
+        "covariance_mm2": (covariance * np.outer(spacing, spacing)).tolist(),
+        "plane": {
+            "row_direction": list(geometry.row_direction),
+            "col_direction": list(geometry.col_direction),
+            "spacing_mm": list(geometry.spacing_mm),
+        },
+        "scan_s": float(
+            sum((s.acquired_to_s or 0.0) - (s.acquired_from_s or 0.0) for s in frames.slices)
+        ),
+    }
+
+
+def _localize(frames: Frames, request: Measurement) -> Localization:
+    low_mm, high_mm = request.request["radius_mm"]
+    spacing = float(np.mean(frames.geometry.spacing_mm))
+    start_px = None
+    gate_px = None
+    expected_mm = request.request["expected_plane_mm"]
+    if expected_mm is not None:
+        origin = _plane_origin_mm(frames.geometry)
+        start_px = (np.array(expected_mm) - origin) / np.array(frames.geometry.spacing_mm)
+        gate_px = request.request["gate_mm"] / spacing
+    return localize(
+        frames.pixels,
+        frames.shifts_px,
+        start_px=start_px,
+        gate_px=gate_px,
+        radius_px=(low_mm / spacing, high_mm / spacing),
+        method=request.method,
+    )
+
+
+def _plane_origin_mm(geometry: SliceGeometry) -> NDArray[np.float64]:
+    """Projections of the centre of pixel (0, 0) onto row and column direction, mm."""
+    position = np.array(geometry.position_mm)
+    return np.array([position @ geometry.row_direction, position @ geometry.col_direction])
+
+
+def _common_geometry(slices: list[SliceRow]) -> SliceGeometry:
+    first = geometry_of(slices[0].header)
+    for row in slices[1:]:
+        other = geometry_of(row.header)
+        same = other.shape == first.shape and all(
+            np.allclose(getattr(other, name), getattr(first, name), atol=_SAME_PLACE)
+            for name in ("position_mm", "row_direction", "col_direction", "spacing_mm")
+        )
+        if not same:
+            raise UnusableSlicesError(
+                "geometry_changed",
+                f"slice {row.sop_instance_uid} does not lie where slice "
+                f"{slices[0].sop_instance_uid} of the same measurement lies",
+            )
+    return first
+
+
+def _reconstruction(case_dir: Path, number: int, frames: Frames, factor: int) -> str | None:
+    """Write the super-resolution image as .npy beside the record; None where there is none."""
+    if len(frames.pixels) < factor**2:
+        return None
+    try:
+        made = reconstruct(frames.pixels, frames.shifts_px, factor=factor, method="fourier")
+    except SingularShiftSetError:
+        return None  # slices at one place only: nothing finer to show
+    folder = case_dir / IMAGES
+    folder.mkdir(exist_ok=True)
+    path = folder / f"measurement-{number}.npy"
+    temporary = path.with_suffix(".part")
+    with temporary.open("wb") as file:
+        np.save(file, made.image.astype(np.float32))
+    temporary.replace(path)
+    return f"{IMAGES}/{path.name}"
