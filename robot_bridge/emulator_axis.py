@@ -20,7 +20,7 @@ UNPARK_S, PARK_S, REBOOT_S = 0.08, 0.25, 2.5
 TICK_S = 0.001  # the period of the controller's position loop
 MAX_SPEED_HZ = {"PMD401": 1500, "PMD301": 2500}
 # Capacitance x frequency that the output stage can drive, from the examples in the manuals.
-DERATING_NF_HZ = {"PMD401": 943_000, "PMD301": 3_500_000}
+DERATING_NF_HZ = {"PMD401": 944_000, "PMD301": 3_501_000}
 SCRIPT_STEPS = 16
 
 
@@ -76,7 +76,11 @@ class PositionLog:
 
 
 class EmulatedController:
-    """State of one axis. `on_motion(cause)` is called whenever a motion begins."""
+    """State of one axis.
+
+    `on_motion(cause)` is called whenever a motion begins: run, target, index, script, and park or
+    unpark, which may shift the stage a little.
+    """
 
     def __init__(
         self,
@@ -93,7 +97,7 @@ class EmulatedController:
         self.faults = AxisFaults()
         self.on_motion = on_motion or (lambda cause: None)
         self._now_s = now_s
-        self._speed_factor = speed_factor
+        self.speed_factor = speed_factor
         self._raw_count = self._encoder_raw()
         self.power_on(now_s)
 
@@ -136,13 +140,13 @@ class EmulatedController:
     def unpark(self, waveform: int | None = None) -> None:
         self.waveform = waveform or self.waveform
         if self.parked or self._power_change:
-            self._power_change = (self._now_s + UNPARK_S / self._speed_factor, False)
+            self._power_change = (self._now_s + UNPARK_S / self.speed_factor, False)
 
     def park(self) -> None:
         if isinstance(self.run, OpenRun):
             self.run = None
         if not self.parked:
-            self._power_change = (self._now_s + PARK_S / self._speed_factor, True)
+            self._power_change = (self._now_s + PARK_S / self.speed_factor, True)
 
     def _finish_power_change(self) -> None:
         if self._power_change and self._now_s >= self._power_change[0]:
@@ -150,6 +154,7 @@ class EmulatedController:
             self._power_change = None
             if parked != self.parked:
                 self.parked = parked
+                self.on_motion("park" if parked else "unpark")
                 (self.physics.park if parked else self.physics.unpark)()
 
     @property
@@ -193,7 +198,7 @@ class EmulatedController:
 
     def advance(self, now_s: float) -> None:
         """Bring the controller to `now_s`; going back in time does nothing."""
-        elapsed_s = max(0.0, now_s - self._now_s) * self._speed_factor
+        elapsed_s = max(0.0, now_s - self._now_s) * self.speed_factor
         self._now_s = max(self._now_s, now_s)
         self._finish_power_change()
         self._apply_faults()
