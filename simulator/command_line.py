@@ -17,7 +17,10 @@ from simulator.scanner import operate
 
 BAD_INPUT = 2
 
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
+
+@app.command()
 def scanner(
     config: Annotated[Path, typer.Option(help="The room's TOML file; its [virtual] table.")],
     exit_with_parent: Annotated[
@@ -74,10 +77,5 @@ def _note(line: str) -> None:
     print(json.dumps({"process": "scanner", "note": line}), file=sys.stderr, flush=True)
 
 
-def main() -> None:
-    """`python -m simulator.command_line --config FILE`."""
-    typer.run(scanner)
-
-
 if __name__ == "__main__":
-    main()
+    app()

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-import typer
 from click.testing import Result
 from conftest import Page, Receiver, Stages
 from typer.testing import CliRunner
@@ -69,9 +68,7 @@ def ready(process: subprocess.Popen[bytes]) -> dict[str, Any]:
 
 
 def run(config: Path) -> Result:
-    app = typer.Typer()
-    app.command()(command_line.scanner)
-    return CliRunner().invoke(app, ["--config", str(config)])
+    return CliRunner().invoke(command_line.app, ["--config", str(config)])
 
 
 def test_the_process_says_where_its_truth_is_scans_and_ends_with_its_parent(
