@@ -28,7 +28,7 @@ from simulator.truth_client import TruthAddress, TruthError, ask_path, ask_where
 
 Note = Callable[[str], None]
 
-_HELD_BACK_AT_MOST_S = 5.0
+_HELD_BACK_AT_MOST_S = 2.5
 _DUPLICATE_AFTER_S = 0.1
 
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import serial
-from conftest import Page, Receiver
+from neighbours import Page, Receiver
 
 from simulator.config import parse_virtual_room
 from simulator.scanner import operate

@@ -12,7 +12,7 @@ from typing import Any
 
 import pytest
 from click.testing import Result
-from conftest import Page, Receiver, Stages
+from neighbours import Page, Receiver, Stages
 from typer.testing import CliRunner
 
 from simulator import command_line
