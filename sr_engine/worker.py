@@ -28,6 +28,7 @@ from sr_engine.reconstruct import reconstruct
 
 IMAGES = "images"
 _SAME_PLACE = 1e-6
+_NEAR_PX = 3.0
 log = structlog.get_logger()
 
 
@@ -163,21 +164,32 @@ def _code_of(error: EngineError | UnusableSlicesError | UnusableError) -> str:
 def _localize(frames: Frames, request: Measurement) -> Localization:
     low_mm, high_mm = request.request["radius_mm"]
     spacing = float(np.mean(frames.geometry.spacing_mm))
-    start_px = None
-    gate_px = None
+    radius_px = (low_mm / spacing, high_mm / spacing)
     expected_mm = request.request["expected_plane_mm"]
-    if expected_mm is not None:
-        origin = _plane_origin_mm(frames.geometry)
-        start_px = (np.array(expected_mm) - origin) / np.array(frames.geometry.spacing_mm)
-        gate_px = request.request["gate_mm"] / spacing
-    return localize(
+    if expected_mm is None:
+        return localize(
+            frames.pixels, frames.shifts_px, radius_px=radius_px, method=request.method
+        )
+    origin = _plane_origin_mm(frames.geometry)
+    expected_px = (np.array(expected_mm) - origin) / np.array(frames.geometry.spacing_mm)
+    gate_px = float(request.request["gate_mm"]) / spacing
+    # a start point must be near; with a wide gate the object is looked for, then held against it
+    near = gate_px <= _NEAR_PX
+    found = localize(
         frames.pixels,
         frames.shifts_px,
-        start_px=start_px,
-        gate_px=gate_px,
-        radius_px=(low_mm / spacing, high_mm / spacing),
+        start_px=expected_px if near else None,
+        radius_px=radius_px,
         method=request.method,
     )
+    miss_px = float(np.linalg.norm(np.asarray(found.centre_px) - expected_px))
+    if not miss_px <= gate_px:
+        raise UnusableSlicesError(
+            "outside_gate",
+            f"the round object found is {miss_px * spacing:.1f} mm from where the fiducial is "
+            f"expected; at most {gate_px * spacing:.1f} mm are believed",
+        )
+    return found
 
 
 def _plane_origin_mm(geometry: SliceGeometry) -> NDArray[np.float64]:
