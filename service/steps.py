@@ -49,12 +49,14 @@ class Measure:
     """Localize the fiducial from all slices of the given holds.
 
     expected_plane_mm and gate_mm: where it must be (image plane), None when nothing is known.
+    shift_sigma_mm: how far a hold may be from its shift, per axis (standard deviation).
     """
 
     holds: tuple[HoldShift, ...]
     method: str
     expected_plane_mm: tuple[float, float] | None = None
     gate_mm: float | None = None
+    shift_sigma_mm: float = 0.0
 
 
 @dataclass(frozen=True)

@@ -20,9 +20,9 @@ from numpy.typing import NDArray
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
 from room_config.load import Config
-from sr_engine.errors import EngineError, SingularShiftSetError
+from sr_engine.errors import EngineError, OutsideGateError, SingularShiftSetError
 from sr_engine.geometry import SliceGeometry
-from sr_engine.localize import Localization, localize
+from sr_engine.localize import SEARCH_PX, Localization, localize
 from sr_engine.reconstruct import reconstruct
 
 IMAGES = "images"
@@ -65,7 +65,7 @@ def measure(record: CaseRecord, request: Measurement, factor: int) -> None:
     number = request.measurement_id
     try:
         frames = gather_frames(record, request)
-        found = _localize(frames, request)
+        found = localize_request(frames, request.method, request.request)
         result = describe_result(frames, found)
         result["reconstruction"] = _reconstruction(record.case_dir, number, frames, factor)
     except (EngineError, UnusableSlicesError, PixelError) as error:
@@ -152,24 +152,44 @@ def describe_result(frames: Frames, found: Localization) -> dict[str, Any]:
     }
 
 
-def _localize(frames: Frames, request: Measurement) -> Localization:
-    low_mm, high_mm = request.request["radius_mm"]
-    spacing = float(np.mean(frames.geometry.spacing_mm))
-    start_px = None
-    gate_px = None
-    expected_mm = request.request["expected_plane_mm"]
-    if expected_mm is not None:
-        origin = _plane_origin_mm(frames.geometry)
-        start_px = (np.array(expected_mm) - origin) / np.array(frames.geometry.spacing_mm)
-        gate_px = request.request["gate_mm"] / spacing
-    return localize(
+def localize_request(frames: Frames, method: str, request: Mapping[str, Any]) -> Localization:
+    """Localize the fiducial where it is expected, or anywhere if nothing is known of its place.
+
+    request: radius_mm (low, high), expected_plane_mm and gate_mm (both None: look everywhere),
+    shift_sigma_mm (standard deviation of a commanded shift, one axis). Raises an EngineError.
+    """
+    spacing = np.array(frames.geometry.spacing_mm)
+    mean_mm = float(np.mean(spacing))
+    low_mm, high_mm = request["radius_mm"]
+    expected_px = gate_px = None
+    if request["expected_plane_mm"] is not None:
+        expected_mm = np.array(request["expected_plane_mm"])
+        expected_px = (expected_mm - _plane_origin_mm(frames.geometry)) / spacing
+        gate_px = float(request["gate_mm"]) / mean_mm
+    # an expectation that is wider than the engine's own search only serves to refuse
+    near = gate_px is not None and gate_px <= SEARCH_PX
+    found = localize(
         frames.pixels,
         frames.shifts_px,
-        start_px=start_px,
-        gate_px=gate_px,
-        radius_px=(low_mm / spacing, high_mm / spacing),
-        method=request.method,
+        start_px=expected_px if near else None,
+        gate_px=gate_px if near else None,
+        radius_px=(low_mm / mean_mm, high_mm / mean_mm),
+        method=method,
+        shift_sigma_px=float(request.get("shift_sigma_mm", 0.0)) / mean_mm,
     )
+    if expected_px is not None and gate_px is not None and not near:
+        _refuse_outside_gate(np.asarray(found.centre_px), expected_px, gate_px)
+    return found
+
+
+def _refuse_outside_gate(
+    centre_px: NDArray[np.float64], expected_px: NDArray[np.float64], gate_px: float
+) -> None:
+    distance_px = float(np.linalg.norm(centre_px - expected_px))
+    if not distance_px <= gate_px:
+        raise OutsideGateError(
+            f"object found {distance_px:.2f} px from where it was expected, allowed {gate_px:.2f}"
+        )
 
 
 def _plane_origin_mm(geometry: SliceGeometry) -> NDArray[np.float64]:
