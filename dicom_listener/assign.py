@@ -28,6 +28,7 @@ from dicom_listener.reasons import Reason
 from sr_engine.geometry import SliceGeometry
 
 ARRIVAL = "arrival"
+_MAY_BE_MISSING = (Reason.AFTER_INCOMPLETE_HOLD, Reason.RECEIVED_AFTER_HOLD)
 
 
 @dataclass(frozen=True)
@@ -59,11 +60,12 @@ class HoldWindow:
 
 @dataclass(frozen=True)
 class Known:
-    """A usable slice that came before this one; hold_id None: it was not assigned."""
+    """A usable slice that came before this one; hold_id None: set aside, for the reason `code`."""
 
     slice: Slice
     received_s: float
     hold_id: int | None
+    code: str = ""
 
 
 @dataclass(frozen=True)
@@ -238,7 +240,11 @@ def _numbers(slice_: Slice) -> str:
 def _after_incomplete_hold(
     slice_: Slice, hold: HoldWindow, holds: Sequence[HoldWindow], known: Sequence[Known]
 ) -> Quarantined | None:
-    """Set aside as many acquisitions as earlier holds lack slices, counted since the first lack."""
+    """Set aside as many acquisitions as earlier holds lack slices, counted since the first lack.
+
+    Only those set aside here, or recognised as of an ended hold, count as found: any other may have
+    been made between the holds.
+    """
     incomplete = [
         (earlier, missing)
         for earlier in holds
@@ -252,7 +258,7 @@ def _after_incomplete_hold(
     doubtful = {
         _acquisition(other.slice)
         for other in known
-        if other.hold_id is None and other.received_s >= since_s
+        if other.code in _MAY_BE_MISSING and other.received_s >= since_s
     }
     if _acquisition(slice_) not in doubtful:
         if len(doubtful) >= sum(missing for _, missing in incomplete):
@@ -302,7 +308,7 @@ def _differs_from_set(
         if not matches:
             return Quarantined(
                 Reason.GEOMETRY_DIFFERS,
-                f"position, orientation or grid is none of those of hold {other.hold_id} in its set",
+                f"position, orientation or grid is not as in hold {other.hold_id} of its set",
             )
         if all(m.distortion_corrected != slice_.distortion_corrected for m in matches):
             return Quarantined(

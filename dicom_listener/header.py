@@ -5,7 +5,7 @@ that we ever use is touched, and what is wrong has a name before the slice goes 
 """
 
 import warnings
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -87,10 +87,6 @@ class Slice:
         """Grows from one acquisition of a study to the next; (-1, -1) where nothing is numbered."""
         series = -1 if self.series_number is None else self.series_number
         return (series, -1 if self.acquisition_number is None else self.acquisition_number)
-
-    def to_record(self) -> dict[str, Any]:
-        """What the case record keeps of a header: plain JSON values."""
-        return asdict(self)
 
 
 def read_header(path: Path, times: TimeFrame = _NO_TIME_FRAME) -> list[Slice]:

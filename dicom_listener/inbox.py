@@ -179,6 +179,12 @@ def _elements(meta: bytes) -> Iterator[tuple[int, bytes]]:
         at += length
 
 
+def is_whole(path: Path) -> bool:
+    """True where the data set in an inbox file is, bit for bit, the one that was received."""
+    envelope, _ = read_envelope(path)
+    return sha256_of(data_set_bytes(path)) == envelope.sha256
+
+
 def data_set_bytes(path: Path) -> bytes:
     """The data set of an inbox file, exactly as it was received."""
     _, start = read_envelope(path)

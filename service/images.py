@@ -5,11 +5,12 @@ from __future__ import annotations
 import io
 
 import numpy as np
-from dicom_listener.pixels import PixelError, magnitude_pixels
 from numpy.typing import NDArray
 from PIL import Image
 
 from case_record.record import CaseRecord
+from dicom_listener.pixels import magnitude_pixels
+from dicom_listener.reasons import UnusableError
 
 _WINDOW_PERCENT = (1.0, 99.8)
 
@@ -23,7 +24,7 @@ def render_slice(record: CaseRecord, slice_id: int) -> bytes:
     row = record.slice(slice_id)
     try:
         pixels = magnitude_pixels(record.case_dir / row.path, row.frame)
-    except PixelError as error:
+    except UnusableError as error:
         raise ImageMissingError(f"slice {slice_id}: {error}") from error
     return png_of(pixels)
 

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import os
 import signal
 import socket
-import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -82,7 +83,10 @@ def on_parent_gone(end: Callable[[], object]) -> None:
     """Call `end` when standard input is closed: whoever started this process is no more."""
 
     def wait() -> None:
-        sys.stdin.buffer.read()
+        # not sys.stdin: a thread inside its lock would break the interpreter's own exit
+        with contextlib.suppress(OSError):
+            while os.read(0, 4096):
+                pass
         structlog.get_logger().info("the parent process is gone: ending")
         end()
 

@@ -83,6 +83,19 @@ class ErrorState(_Frozen):
     target_px: tuple[float, float] | None = None
 
 
+class ArrivalState(_Frozen):
+    """READY: how the needle guide came to the target, and how sure that is."""
+
+    procedure_id: int
+    measurement_id: int
+    error_mm: float
+    sigma_mm: float
+    probability: float
+    iterations: int
+    frames: int
+    scan_s: float
+
+
 class RoomState(_Frozen):
     """Everything that a screen needs to show what is going on."""
 
@@ -96,6 +109,7 @@ class RoomState(_Frozen):
     last_outcome: str = ""
     prompt: str = ""
     ready: bool = False
+    arrival: ArrivalState | None = None
     robot: RobotState = RobotState()
     acquisition_request: AcquisitionState | None = None
     question: QuestionState | None = None
@@ -129,7 +143,8 @@ def describe(
     ended = next((p for p in reversed(record.procedures()) if p.state != "running"), None)
     last = record.last_slice()
     target = record.last_event("target_set")
-    ready = ready_arrival(record) is not None
+    arrival = ready_arrival(record)
+    ready = arrival is not None
     measurement = _measurement(record)
     state = RoomState(
         revision=before.revision,
@@ -142,6 +157,7 @@ def describe(
         last_outcome="" if ended is None else _outcome_text(ended.name, ended.state, ended.result),
         prompt=execution.prompt or _idle_prompt(record, link, ready),
         ready=ready,
+        arrival=None if arrival is None else _arrival(*arrival),
         robot=_robot(link, before.robot),
         acquisition_request=None
         if execution.request is None
@@ -184,6 +200,11 @@ def _robot(link: RoomLink, before: RobotState) -> RobotState:
         fault=status.fault,
         boot_id=status.boot_id,
     )
+
+
+def _arrival(procedure_id: int, result: dict[str, Any]) -> ArrivalState:
+    names = set(ArrivalState.model_fields) - {"procedure_id"}
+    return ArrivalState(procedure_id=procedure_id, **{name: result[name] for name in names})
 
 
 def _measurement(record: CaseRecord) -> MeasurementState | None:

@@ -217,6 +217,12 @@ def _point(link: Path, name: str) -> None:
     fresh.replace(link)
 
 
+def _end_with_parent() -> None:
+    while os.read(0, 4096):
+        pass
+    os._exit(0)  # nothing to save: a line has no state
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(prog="python -m simulator.serial_line", description=__doc__)
     parser.add_argument("--near", type=Path, required=True, help="link to one end's terminal")
@@ -226,6 +232,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     for field in fields(LineFaults):
         name = "--" + field.name.replace("_", "-")
         parser.add_argument(name, type=float, default=field.default)
+    parser.add_argument("--exit-with-parent", action="store_true", help="end with standard input")
     args = parser.parse_args(argv)
     try:
         faults = LineFaults(**{f.name: getattr(args, f.name) for f in fields(LineFaults)})
@@ -235,6 +242,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"serial_line: {error}", file=sys.stderr)
         return 2
+    if args.exit_with_parent:
+        threading.Thread(target=_end_with_parent, daemon=True).start()
     print(json.dumps({"ready": True, "near": str(args.near), "far": str(args.far)}), flush=True)
     try:
         modem.serve()

@@ -99,3 +99,75 @@ def image_of(
     across = np.cos(2 * np.pi * np.outer(rows - centre_px[0], space.k_row))
     along = np.cos(2 * np.pi * np.outer(cols - centre_px[1], space.k_col))
     return np.asarray(across @ (spectrum * space.weight) @ along.T)
+
+
+@dataclass(frozen=True)
+class Shape:
+    """What the round object is: a disc, or a sphere cut by a slab (z_offset, thickness) in px."""
+
+    slab_px: tuple[float, float] | None = None
+
+    def spectrum(self, k_abs: Array, radius_px: float) -> Array:
+        if self.slab_px is None:
+            return disc_spectrum(k_abs, radius_px)
+        return sphere_slab_spectrum(k_abs, radius_px, self.slab_px)
+
+
+DISC = Shape()
+_RADIUS_STEP = 0.125  # between expansion points; third order then errs by 1e-6 of the peak
+
+
+@lru_cache(maxsize=96)
+def _expansion(
+    period: tuple[int, int], psf: Psf, shape: Shape, radius_px: float
+) -> tuple[Array, Array, Array, Array]:
+    """Weighted spectrum at radius_px and its Taylor coefficients in the radius."""
+    space = k_space(period, psf)
+    k, w = space.k_abs, space.weight
+    if shape.slab_px is not None:
+        h = _RADIUS_STEP / 2
+        low, mid, high = (shape.spectrum(k, radius_px + d) * w for d in (-h, 0.0, h))
+        return mid, (high - low) / (2 * h), (high - 2 * mid + low) / (2 * h * h), np.zeros_like(w)
+    q = 2 * np.pi * k
+    b0, b1 = j0(q * radius_px), j1(q * radius_px)
+    first = 2 * np.pi * radius_px * b0
+    second = 2 * np.pi * (b0 - q * radius_px * b1)
+    third = -2 * np.pi * q * (b1 + q * radius_px * b0)
+    zeroth = disc_spectrum(k, radius_px)
+    return zeroth * w, first * w, second * w / 2, third * w / 6
+
+
+def spectrum_near(
+    period: tuple[int, int], psf: Psf, shape: Shape, radius_px: float
+) -> tuple[Array, Array]:
+    """Weighted spectrum and its derivative in the radius, from the nearest cached expansion."""
+    base = max(round(radius_px / _RADIUS_STEP), 1) * _RADIUS_STEP
+    d = radius_px - base
+    c0, c1, c2, c3 = _expansion(period, psf, shape, base)
+    return c0 + d * (c1 + d * (c2 + d * c3)), c1 + d * (2 * c2 + 3 * d * c3)
+
+
+@dataclass(frozen=True, eq=False)
+class Patch:
+    """A rectangle of pixels of a frame, and the period of the frame that it is from."""
+
+    rows: Array
+    cols: Array
+    period: tuple[int, int]
+
+
+def unit_object(
+    patch: Patch, psf: Psf, shape: Shape, centre_px: tuple[float, float], radius_px: float
+) -> tuple[Array, Array, Array, Array]:
+    """Image of a unit object on the patch, and its derivatives by row, column and radius."""
+    space = k_space(patch.period, psf)
+    spectrum, by_radius = spectrum_near(patch.period, psf, shape, radius_px)
+    q_row, q_col = 2 * np.pi * space.k_row, 2 * np.pi * space.k_col
+    angle_row = np.outer(patch.rows - centre_px[0], q_row)
+    angle_col = np.outer(patch.cols - centre_px[1], q_col)
+    cos_row, cos_col = np.cos(angle_row), np.cos(angle_col)
+    half = spectrum @ cos_col.T
+    value = cos_row @ half
+    by_row = (np.sin(angle_row) * q_row) @ half
+    by_col = cos_row @ (spectrum @ (np.sin(angle_col) * q_col).T)
+    return value, by_row, by_col, cos_row @ (by_radius @ cos_col.T)

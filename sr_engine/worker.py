@@ -14,11 +14,12 @@ from typing import Any
 
 import numpy as np
 import structlog
-from dicom_listener.pixels import PixelError, magnitude_pixels
 from numpy.typing import NDArray
 
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
+from dicom_listener.pixels import magnitude_pixels
+from dicom_listener.reasons import UnusableError
 from room_config.load import Config
 from sr_engine.errors import EngineError, OutsideGateError, SingularShiftSetError
 from sr_engine.geometry import SliceGeometry
@@ -68,10 +69,9 @@ def measure(record: CaseRecord, request: Measurement, factor: int) -> None:
         found = localize_request(frames, request.method, request.request)
         result = describe_result(frames, found)
         result["reconstruction"] = _reconstruction(record.case_dir, number, frames, factor)
-    except (EngineError, UnusableSlicesError, PixelError) as error:
-        code = getattr(error, "code", None) or getattr(error, "reason", "unusable")
+    except (EngineError, UnusableSlicesError, UnusableError) as error:
         with record.transaction():
-            record.fail_measurement(number, str(code), str(error))
+            record.fail_measurement(number, _code_of(error), str(error))
             record.append_event(
                 "measurement_failed",
                 {"measurement_id": number, "reason": str(error)},
@@ -150,6 +150,14 @@ def describe_result(frames: Frames, found: Localization) -> dict[str, Any]:
             sum((s.acquired_to_s or 0.0) - (s.acquired_from_s or 0.0) for s in frames.slices)
         ),
     }
+
+
+def _code_of(error: EngineError | UnusableSlicesError | UnusableError) -> str:
+    if isinstance(error, UnusableSlicesError):
+        return error.code
+    if isinstance(error, UnusableError):
+        return str(error.reason.code)
+    return str(error.reason)
 
 
 def localize_request(frames: Frames, method: str, request: Mapping[str, Any]) -> Localization:

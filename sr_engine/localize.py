@@ -1,0 +1,313 @@
+"""Where the fiducial is, with covariance, from one frame or several at known shifts.
+
+Every frame is fitted by itself (see `fit`); the centres, less their shifts, are averaged with the
+inverse of their covariances as weights. This equals the joint fit, because the centre is
+orthogonal to all that a frame has of its own. What is left over, frame by frame, tells whether
+the frames agree with their shifts.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.stats import chi2 as chi2_distribution
+
+from sr_engine.checks import (
+    checked_frames,
+    checked_point,
+    checked_radii,
+    checked_shifts,
+    refuse_saturated,
+)
+from sr_engine.errors import (
+    AmbiguousObjectError,
+    InconsistentFramesError,
+    NoRoundObjectError,
+    NotConvergedError,
+    ObjectAtBorderError,
+    OutsideGateError,
+    ParameterError,
+)
+from sr_engine.fit import DiscFit, Pixels, fit_disc
+from sr_engine.match import best_matches, correlate, radius_grid
+from sr_engine.model import DISC, Patch, Shape
+from sr_engine.noise import NoiseKind
+from sr_engine.psf import Psf
+
+Array = NDArray[np.float64]
+
+MARGIN_PX = 4.0  # of surroundings that are fitted with the object
+SEARCH_PX = 3.0  # how far from a given start the object may be
+DEFAULT_RADII_PX = (1.5, 12.0)
+MINIMUM_SCORE = 0.5  # of the matched filter
+AMBIGUOUS_RATIO = 0.9  # a second candidate of this share of the best score is as good
+MINIMUM_EXPLAINED = 60.0  # chi2 that an object must take away to be one
+CONSISTENCY_P = 1e-5  # frames that agree look as bad as this once in 100,000 measurements
+MODEL_FLOOR_PX = 0.005  # what an imperfect point spread may do to one frame; check only
+FOLDING_MARGIN_PX = 6.0
+
+
+@dataclass(frozen=True, eq=False)
+class Localization:
+    """Centre of the fiducial in the reference pose, and how well it is known.
+
+    centre_px: (row, col), pixel (0, 0) has its centre at (0.0, 0.0).
+    covariance_px2: (2, 2) of the centre, row and col.
+    radius_px, amplitude, background, snr: means over the frames; amplitude is negative for an
+      object darker than what surrounds it; snr = |amplitude| / noise std per channel.
+    residuals_px: (N, 2), what each frame's centre less its shift differs by from centre_px.
+    chi2_per_dof: of the residuals against their covariances (2N - 2 degrees of freedom); for one
+      frame, of its pixels against the model.
+    """
+
+    centre_px: Array
+    covariance_px2: Array
+    radius_px: float
+    amplitude: float
+    background: float
+    snr: float
+    sigma: float
+    chi2_per_dof: float
+    n_frames: int
+    method: str
+    residuals_px: Array
+    psf: Psf
+
+    @property
+    def sigma_px(self) -> Array:
+        """Standard deviations (row, col)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance_px2)))
+
+
+def localize(
+    frames: ArrayLike,
+    shifts_px: ArrayLike | None = None,
+    *,
+    start_px: ArrayLike | None = None,
+    radius_px: tuple[float, float] | float | None = None,
+    method: str = "ml",
+    psf: Psf | None = None,
+    shape: Shape = DISC,
+    noise: NoiseKind | None = None,
+    sigma: float | None = None,
+    shift_sigma_px: float = 0.0,
+    gate_px: float | None = None,
+    saturation_level: float | None = None,
+    robust: bool = True,
+) -> Localization:
+    """Localize one round object in frames of one size taken at known shifts.
+
+    frames: (rows, cols) or (N, rows, cols), magnitude pixels (whole frames: their size tells the
+      sampling of k-space).
+    shifts_px: (N, 2), displacement (row, col) of the object in frame k from the reference pose.
+      May be left out for one frame.
+    start_px: where the object is in the reference pose, to within 3 px; else it is looked for.
+    radius_px: (low, high), or one number within 25 %; default 1.5 to 12 px.
+    psf: point spread; default flat k-space. noise: "rician", or "gaussian" (default for a psf
+      that folds, a camera). sigma: noise std per channel where known.
+    shift_sigma_px: std per axis of a frame's shift (the motor's repeatability).
+    gate_px: refuse an object farther than this from start_px.
+    saturation_level: pixel value at which the source saturates, where known.
+
+    Raises a subclass of EngineError; never returns a centre that it does not stand for.
+    """
+    if method != "ml":
+        raise ParameterError(f"unknown method '{method}' here, known: ml")
+    stack = checked_frames(frames)
+    shifts = checked_shifts(shifts_px, len(stack))
+    radii = checked_radii(radius_px) or DEFAULT_RADII_PX
+    start = checked_point(start_px, "start_px")
+    psf = psf or Psf()
+    noise = noise or ("gaussian" if psf.folds else "rician")
+
+    guess = _first_guess(stack[0], start, shifts[0], radii)
+    fits: list[DiscFit] = []
+    for frame, shift in zip(stack, shifts, strict=True):
+        begin = (guess[0] + shift[0], guess[1] + shift[1], guess[2])
+        pixels = region_of_interest(frame, begin, psf)
+        refuse_saturated(pixels.values, guess[2], saturation_level)
+        bounds = (0.8 * radii[0], 1.2 * radii[1])
+        fit = fit_disc(
+            pixels, begin, psf, radius_bounds_px=bounds, shape=shape,
+            noise=noise, sigma=sigma, robust=robust,
+        )  # fmt: skip
+        _refuse_doubtful(fit, begin, frame.shape)
+        fits.append(fit)
+        guess = (*(fit.centre_px - shift), fit.radius_px)
+    result = _combine(fits, shifts, psf, shift_sigma_px)
+    _refuse_outside_gate(result.centre_px, start, gate_px)
+    return result
+
+
+def region_of_interest(
+    frame: Array, guess: tuple[float, float, float], psf: Psf, margin_px: float = MARGIN_PX
+) -> Pixels:
+    """The pixels within radius + margin of the guess (row, col, radius), clipped at the frame.
+
+    Raises ObjectAtBorderError where the object itself is not wholly inside of the frame.
+    """
+    row, col, radius = guess
+    refuse_cut_by_border((row, col), radius, (frame.shape[0], frame.shape[1]))
+    reach = radius + margin_px
+    spans = []
+    for centre, n in ((row, frame.shape[0]), (col, frame.shape[1])):
+        spans.append(
+            (max(0, int(np.floor(centre - reach))), min(n, int(np.ceil(centre + reach)) + 1))
+        )
+    (r0, r1), (c0, c1) = spans
+    rows, cols = np.arange(r0, r1, dtype=float), np.arange(c0, c1, dtype=float)
+    mask = np.hypot(rows[:, None] - row, cols[None, :] - col) <= reach
+    period = (frame.shape[0], frame.shape[1])
+    if psf.folds:  # such a point spread ends after a pixel or two: a small period is as good
+        size = int(np.ceil(2 * (reach + FOLDING_MARGIN_PX)))
+        period = (size, size)
+    return Pixels(Patch(rows, cols, period), frame[r0:r1, c0:c1], mask)
+
+
+def refuse_cut_by_border(
+    centre_px: tuple[float, float], radius_px: float, shape: tuple[int, int]
+) -> None:
+    """Raise ObjectAtBorderError unless the disc lies wholly inside of the frame."""
+    for name, centre, n in zip(("row", "col"), centre_px, shape, strict=True):
+        if not radius_px - 0.5 <= centre <= n - 0.5 - radius_px:
+            raise ObjectAtBorderError(
+                f"object of radius {radius_px:.1f} px at {name} {centre:.1f} is cut by the border "
+                f"of {n} {name}s"
+            )
+
+
+def _first_guess(
+    frame: Array,
+    start: tuple[float, float] | None,
+    shift: Array,
+    radii: tuple[float, float],
+) -> tuple[float, float, float]:
+    """(row, col, radius) in the reference pose, from the matched filter on the first frame."""
+    if start is None:
+        centre, radius = _search(frame, (0, 0), radii, unique=True)
+    else:
+        expected = (start[0] + shift[0], start[1] + shift[1])
+        inside = all(-0.5 <= x <= n - 0.5 for x, n in zip(expected, frame.shape, strict=True))
+        if not inside:
+            raise ObjectAtBorderError(
+                f"start ({expected[0]:.1f}, {expected[1]:.1f}) is outside of the frame"
+            )
+        centre, radius = _search_near(frame, expected, radii)
+    return centre[0] - shift[0], centre[1] - shift[1], radius
+
+
+def _search_near(
+    frame: Array, expected: tuple[float, float], radii: tuple[float, float]
+) -> tuple[tuple[float, float], float]:
+    reach = int(np.ceil(radii[1] + MARGIN_PX + SEARCH_PX))
+    r0, c0 = (max(0, round(x) - reach) for x in expected)
+    part = frame[r0 : round(expected[0]) + reach + 1, c0 : round(expected[1]) + reach + 1]
+    grid = radius_grid(*radii)
+    scores = correlate(part, grid)
+    rows, cols = np.indices(part.shape)
+    far = np.hypot(rows + r0 - expected[0], cols + c0 - expected[1]) > SEARCH_PX
+    scores[:, far] = 0.0
+    match = best_matches(scores, grid, 1, 1.0)
+    if not match or abs(match[0].score) < MINIMUM_SCORE:
+        raise NoRoundObjectError(
+            f"no round object within {SEARCH_PX:g} px of row {expected[0]:.1f}, "
+            f"col {expected[1]:.1f}"
+        )
+    row, col = match[0].centre_px
+    return (row + r0, col + c0), match[0].radius_px
+
+
+def _search(
+    frame: Array, origin: tuple[int, int], radii: tuple[float, float], unique: bool
+) -> tuple[tuple[float, float], float]:
+    grid = radius_grid(*radii)
+    matches = best_matches(correlate(frame, grid), grid, 2, apart_px=2 * radii[0])
+    if not matches or abs(matches[0].score) < MINIMUM_SCORE:
+        raise NoRoundObjectError(
+            f"no round object of radius {radii[0]:.1f} to {radii[1]:.1f} px stands out"
+        )
+    best = matches[0]
+    if unique and len(matches) > 1:
+        second = matches[1]
+        if abs(second.score) > AMBIGUOUS_RATIO * abs(best.score):
+            raise AmbiguousObjectError(
+                f"two round objects are equally good, at row {best.centre_px[0]:.1f} col "
+                f"{best.centre_px[1]:.1f} and at row {second.centre_px[0]:.1f} col "
+                f"{second.centre_px[1]:.1f}: give a start or a narrower radius range"
+            )
+    return (best.centre_px[0] + origin[0], best.centre_px[1] + origin[1]), best.radius_px
+
+
+def _refuse_doubtful(
+    fit: DiscFit, begin: tuple[float, float, float], frame_shape: tuple[int, ...]
+) -> None:
+    if not fit.explained > MINIMUM_EXPLAINED:
+        raise NoRoundObjectError(
+            f"what was found at row {begin[0]:.1f}, col {begin[1]:.1f} does not stand out from "
+            f"the noise (chi2 {fit.explained:.0f}, needs {MINIMUM_EXPLAINED:.0f})"
+        )
+    moved = float(np.hypot(*(fit.centre_px - begin[:2])))
+    if not moved < max(2.0, 0.5 * begin[2]):
+        raise NotConvergedError(f"the fit ran {moved:.1f} px away from its start")
+    refuse_cut_by_border(
+        (float(fit.centre_px[0]), float(fit.centre_px[1])),
+        fit.radius_px,
+        (frame_shape[0], frame_shape[1]),
+    )
+
+
+def _combine(fits: list[DiscFit], shifts: Array, psf: Psf, shift_sigma_px: float) -> Localization:
+    centres = np.array([fit.centre_px for fit in fits]) - shifts
+    jitter = np.eye(2) * shift_sigma_px**2
+    covariances = np.array([fit.covariance_px2 for fit in fits]) + jitter
+    information = np.linalg.inv(covariances)
+    covariance = np.linalg.inv(information.sum(axis=0))
+    centre = covariance @ np.einsum("kij,kj->i", information, centres)
+    residuals = centres - centre
+    chi2_per_dof = fits[0].chi2_per_dof
+    if len(fits) > 1:
+        chi2_per_dof = _checked_consistency(residuals, covariances)
+    return Localization(
+        centre_px=centre,
+        covariance_px2=covariance,
+        radius_px=float(np.mean([fit.radius_px for fit in fits])),
+        amplitude=float(np.mean([fit.amplitude for fit in fits])),
+        background=float(np.mean([fit.parameters[4] for fit in fits])),
+        snr=float(np.mean([fit.snr for fit in fits])),
+        sigma=float(np.mean([fit.sigma for fit in fits])),
+        chi2_per_dof=chi2_per_dof,
+        n_frames=len(fits),
+        method="ml",
+        residuals_px=residuals,
+        psf=psf,
+    )
+
+
+def _checked_consistency(residuals: Array, covariances: Array) -> float:
+    """chi2 per degree of freedom of the residuals; raises where chance does not explain them."""
+    dof = residuals.size - 2
+    exact = np.einsum("ki,kij,kj->k", residuals, np.linalg.inv(covariances), residuals)
+    widened = np.linalg.inv(covariances + np.eye(2) * MODEL_FLOOR_PX**2)
+    guarded = np.einsum("ki,kij,kj->k", residuals, widened, residuals)
+    if not guarded.sum() < chi2_distribution.isf(CONSISTENCY_P, dof):
+        worst = int(np.argmax(guarded))
+        row, col = residuals[worst]
+        raise InconsistentFramesError(
+            f"the frames disagree with their shifts (chi2 {guarded.sum():.0f} for {dof} degrees "
+            f"of freedom), most of all frame {worst}, by row {row:+.3f} col {col:+.3f} px"
+        )
+    return float(exact.sum() / dof)
+
+
+def _refuse_outside_gate(
+    centre_px: Array, start: tuple[float, float] | None, gate_px: float | None
+) -> None:
+    if gate_px is None:
+        return
+    if start is None:
+        raise ParameterError("a gate needs a predicted position: give start_px")
+    distance = float(np.hypot(centre_px[0] - start[0], centre_px[1] - start[1]))
+    if not distance <= gate_px:
+        raise OutsideGateError(
+            f"object found {distance:.2f} px from where it was predicted, allowed {gate_px:g} px"
+        )

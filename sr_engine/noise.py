@@ -1,0 +1,87 @@
+"""Moments of magnitude (Rician) and real (Gaussian) pixels, and how the noise is coloured.
+
+Gudbjartsson & Patz, MRM 34:910 (1995).
+"""
+
+from dataclasses import dataclass
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.special import i0e, i1e
+
+from sr_engine.psf import Psf
+
+Array = NDArray[np.float64]
+NoiseKind = Literal["rician", "gaussian"]
+
+_FAR_FROM_ZERO = 30.0  # in sigma: beyond it the exact variance cancels and the series is exact
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Of pixels with a known noise-free signal: mean, its two derivatives in it, and variance."""
+
+    mean: Array
+    slope: Array
+    curvature: Array
+    variance: Array
+
+
+def moments(signal: Array, sigma: float, kind: NoiseKind) -> Moments:
+    """Moments of pixels with noise of std `sigma` per channel."""
+    if kind == "gaussian":
+        one = np.ones_like(signal)
+        return Moments(signal, one, np.zeros_like(signal), sigma**2 * one)
+    ratio = signal / sigma
+    x = ratio**2 / 4
+    b0, b1 = i0e(x), i1e(x)
+    root = np.sqrt(np.pi / 2)
+    mean = root * ((1 + 2 * x) * b0 + 2 * x * b1)
+    far = np.abs(ratio) > _FAR_FROM_ZERO
+    variance = np.where(far, 1 - 0.5 / np.where(far, ratio, 1.0) ** 2, ratio**2 + 2 - mean**2)
+    return Moments(
+        mean=sigma * mean,
+        slope=root * ratio / 2 * (b0 + b1),
+        curvature=root / (2 * sigma) * (b0 - b1),
+        variance=sigma**2 * variance,
+    )
+
+
+def sigma_of(values: Array, signal: Array, sigma: float, kind: NoiseKind, n_fitted: int) -> float:
+    """Next estimate of the noise std per channel, from pixels and the signal fitted to them.
+
+    One fixed-point step of the likelihood equation in sigma: a pixel far from zero shows one
+    channel of noise, a pixel without signal both. n_fitted: parameters that the signal took.
+    """
+    if kind == "gaussian":
+        squares, count = (values - signal) ** 2, float(values.size)
+    else:
+        size = np.abs(signal)
+        z = values * size / sigma**2
+        hidden = 2 * z * (1 - i1e(z) / i0e(z))
+        squares, count = (values - size) ** 2, float(np.sum(2 - hidden))
+    return float(np.sqrt(np.sum(squares) / max(count - n_fitted, 1.0)))
+
+
+@lru_cache(maxsize=16)
+def correlation(period: tuple[int, int], psf: Psf, reach: int) -> Array:
+    """Correlation of the noise at lags 0..reach along rows and columns: (reach+1, reach+1).
+
+    Noise enters k-space white and passes the same window as the signal. Cameras have white noise.
+    """
+    lags = np.arange(reach + 1, dtype=float)
+    if psf.folds:
+        return np.asarray((lags[:, None] == 0) & (lags[None, :] == 0), dtype=float)
+    k_row, k_col = np.fft.fftfreq(period[0]), np.fft.fftfreq(period[1])
+    power = psf.window(k_row[:, None], k_col[None, :]) ** 2
+    across = np.cos(2 * np.pi * np.outer(lags, k_row))
+    along = np.cos(2 * np.pi * np.outer(lags, k_col))
+    covariance = across @ power @ along.T
+    return np.asarray(covariance / covariance[0, 0])
+
+
+def is_white(psf: Psf) -> bool:
+    """True where noise is independent from pixel to pixel."""
+    return psf.folds or (psf.kind == "flat" and psf.acquired == (1.0, 1.0))
