@@ -50,12 +50,10 @@ class FiducialEstimate:
             axis: (setpoints_um[axis] - self.setpoints_um[axis]) / 1000.0 for axis in jacobian.axes
         }
         displacement, covariance = jacobian.displacement(change_mm)
-        columns = (jacobian.columns[:, (0, 2)] + jacobian.columns[:, (1, 3)]) / 2
-        scatter = np.diag([noise.variance_mm2(change_mm[axis]) for axis in jacobian.axes])
         return FiducialEstimate(
             dict(setpoints_um),
             self.plane_mm + displacement,
-            self.covariance_mm2 + covariance + columns @ scatter @ columns.T,
+            self.covariance_mm2 + covariance + motion_covariance(change_mm, jacobian, noise),
         )
 
     def fused_with(self, plane_mm: Array, covariance_mm2: Array) -> FiducialEstimate:
@@ -85,6 +83,15 @@ class FiducialEstimate:
         return cls(
             value["setpoints_um"], np.array(value["plane_mm"]), np.array(value["covariance_mm2"])
         )
+
+
+def motion_covariance(
+    change_mm: Mapping[str, float], jacobian: ImageJacobian, noise: MotionNoise
+) -> Array:
+    """Covariance (2, 2) mm² in the image plane of what one move does beside what it should."""
+    columns = (jacobian.columns[:, (0, 2)] + jacobian.columns[:, (1, 3)]) / 2
+    scatter = np.diag([noise.variance_mm2(change_mm[axis]) for axis in jacobian.axes])
+    return np.asarray(columns @ scatter @ columns.T)
 
 
 def probability_within(offset_mm: Array, covariance_mm2: Array, tolerance_mm: float) -> float:

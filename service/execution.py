@@ -185,7 +185,7 @@ class Execution:
     # Slices and measurements
 
     def _acquire(self, step: Acquire) -> Acquired:
-        hold = self._hold_to_image()
+        hold = self._hold_to_image(fresh=step.fresh)
         self._record.expect_slices(hold.hold_id, step.count)
         attempt = 0
         while True:
@@ -215,13 +215,14 @@ class Execution:
                 return
             self._wait()
 
-    def _hold_to_image(self) -> Hold:
-        """The open hold; a new one where the robot stands, if it was ended by a restart."""
+    def _hold_to_image(self, *, fresh: bool) -> Hold:
+        """The open hold; a new one where the robot stands if asked for, or after a restart."""
         while True:
             hold = self._record.open_hold()
             status = self._link.status
             if status is not None and not status.moving and status.position_certain:
-                if hold is not None and hold.readback_um == dict(status.positions_um):
+                stands = hold is not None and hold.readback_um == dict(status.positions_um)
+                if hold is not None and stands and not fresh:
                     return hold
                 with self._record.transaction():
                     self._record.end_open_hold(time.time())

@@ -31,9 +31,13 @@ class MoveTo:
 
 @dataclass(frozen=True)
 class Acquire:
-    """Wait until `count` slices in all were acquired at the present hold."""
+    """Wait until `count` slices in all were acquired at the present hold.
+
+    fresh: begin a new hold here first, without any motion, so that earlier slices do not count.
+    """
 
     count: int
+    fresh: bool = False
 
 
 @dataclass(frozen=True)

@@ -154,6 +154,8 @@ class OfflineRoom:
         return Moved("DONE", "", "", hold_id, dict(self.setpoints_um))
 
     def _acquire(self, step: Acquire) -> Acquired:
+        if step.fresh:
+            self._slices[max(self._slices) + 1] = []
         hold_id = max(self._slices)
         slices = self._slices[hold_id]
         while len(slices) < step.count:
