@@ -153,9 +153,14 @@ class Intake:
         return len(removed)
 
     def alarm(self, kind: str, text: str) -> None:
+        """Count, log and record something that a person should know of."""
         self._metrics.alarms.labels(kind).inc()
-        self._event("alarm", {"alarm": kind, "text": text})
         log.warning(kind, text=text)
+        self.note_alarm(kind, text)
+
+    def note_alarm(self, kind: str, text: str) -> None:
+        """Record an alarm that was counted and logged where it arose."""
+        self._event("alarm", {"alarm": kind, "text": text})
 
     # One file
 
@@ -297,6 +302,9 @@ class Intake:
             for scanner in self._clocks:
                 self._clocks[scanner] = ScannerClock(sync=sync)
             self._rules = replace(self._rules, sync=sync)
+        elif kind == "clock_reset":
+            self._clocks.clear()
+            self._rules = replace(self._rules, sync=None)
         elif kind == "slice_reassigned" and not replaying:
             self._follow(self._record.slice(int(body["slice_id"])))
 

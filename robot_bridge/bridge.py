@@ -45,6 +45,7 @@ from robot_bridge.phases import ALLOWED, WorkPhase
 IDLE_POLL_S = 0.2
 STOP_AGAIN_S = 0.1
 STANDSTILL_BOUND_S = 3.0
+PARK_AGAIN_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -107,6 +108,7 @@ class Bridge:
         self._ticked_s = clock()
         self._polled_s = clock()
         self._stopped_motors_s = clock()
+        self._parked_s = clock()
         self._stop_unconfirmed = False
         self._close_old_commands()
 
@@ -177,10 +179,13 @@ class Bridge:
                     self.end.answer(event.sequence, self._answer(event.request))
 
     def _receive_stop(self, stop: StopReceived) -> None:
-        self._stop_motors()
-        self.end.acknowledge_stop(stop)
         known = self.stopped and stop.nonce == self._last_stop_nonce
-        if known and not (stop.emergency and self.phase is not WorkPhase.EMERGENCY):
+        if known and stop.emergency:
+            known = self.phase is WorkPhase.EMERGENCY
+        if not known or self._stop_unconfirmed:
+            self._stop_motors()
+        self.end.acknowledge_stop(stop)
+        if known:
             return
         self._last_stop_nonce = stop.nonce
         code = Code.EMERGENCY_STOP if stop.emergency else Code.OPERATOR_STOP
@@ -385,6 +390,8 @@ class Bridge:
             self.stop_for(Code.MOTOR_FAULT, "an axis moves without a command")
         elif self.motor_status.fault is not None and self.armed:
             self.stop_for(Code.MOTOR_FAULT, self.motor_status.fault_text)
+        if self.phase is WorkPhase.EMERGENCY and not self.motor_status.parked:
+            self._park_again(now_s)
         if self._stop_unconfirmed and now_s - self._stopped_motors_s > STOP_AGAIN_S:
             self._stop_motors()
 
@@ -474,7 +481,13 @@ class Bridge:
         except MotorError:
             self._stop_unconfirmed = True  # tried again every STOP_AGAIN_S
 
+    def _park_again(self, now_s: float) -> None:
+        # A stop that came after the parking began has cut it short.
+        if self._motion is None and now_s - self._parked_s > PARK_AGAIN_S:
+            self._park_motors()
+
     def _park_motors(self) -> None:
+        self._parked_s = self._clock()
         try:
             self._motors.park()
         except MotorError as error:

@@ -152,8 +152,9 @@ class BridgeClient:
         open_transport: Callable[[], Transport] | None = None,
         clock: Callable[[], float] = time.monotonic,
         pause: Callable[[float], None] = time.sleep,
+        stop_thread: bool = True,
     ) -> None:
-        """`open_transport`, `clock` and `pause` replace the line and the time (virtual time)."""
+        """The last four replace the line and the time, for a client that lives in virtual time."""
         self._url = url
         self._name = name
         self._heartbeat_s = heartbeat_s
@@ -174,7 +175,7 @@ class BridgeClient:
         self._known_motion = ""
         self._answer: messages.Answer | None = None
         self._sessions = 0
-        self._stopper = _Stopper(self._write_stop)
+        self._stopper = _Stopper(self._write_stop, clock, threaded=stop_thread)
 
     # --- session ------------------------------------------------------------------------------
 
@@ -515,6 +516,7 @@ class BridgeClient:
         for event in [*self._end.receive(data, now_s), *self._end.tick(now_s)]:
             self._act(event, now_s)
         self._flush()
+        self._stopper.repeat_if_due()
         self._check_heard(now_s)
 
     def _act(self, event: ServiceEvent, now_s: float) -> None:
@@ -556,13 +558,22 @@ class BridgeClient:
 
 
 class _Stopper:
-    """Repeats STOP until it is acknowledged, whatever the control thread is doing meanwhile."""
+    """Repeats STOP until it is acknowledged.
 
-    def __init__(self, write: Callable[[bytes], None]) -> None:
+    The control thread repeats it as it pumps; a thread of the stopper's own does when the control
+    thread does not, whatever keeps it.
+    """
+
+    def __init__(
+        self, write: Callable[[bytes], None], clock: Callable[[], float], threaded: bool
+    ) -> None:
         self.sent = 0
         self._write = write
+        self._clock = clock
+        self._threaded = threaded
         self._changed = threading.Condition()
         self._pending: tuple[int, bool] | None = None
+        self._sent_s = 0.0
         self._closed = False
         self._thread: threading.Thread | None = None
 
@@ -574,12 +585,13 @@ class _Stopper:
         with self._changed:
             if self._pending is not None:
                 emergency = emergency or self._pending[1]
-            pending = self._pending = (secrets.randbits(32), emergency)
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._repeat, name="stop", daemon=True)
+            self._pending = (secrets.randbits(32), emergency)
+            self._sent_s = -1e9
+            if self._thread is None and self._threaded:
+                self._thread = threading.Thread(target=self._watch, name="stop", daemon=True)
                 self._thread.start()
             self._changed.notify()
-        self._send(pending)
+        self.repeat_if_due()
 
     def acknowledged(self, nonce: int) -> None:
         with self._changed:
@@ -591,23 +603,27 @@ class _Stopper:
             self._closed = True
             self._changed.notify()
 
-    def _send(self, pending: tuple[int, bool]) -> None:
-        self.sent += 1
-        try:
+    def repeat_if_due(self) -> None:
+        if self._pending is None:
+            return
+        with self._changed:
+            pending, now_s = self._pending, self._clock()
+            if pending is None or now_s - self._sent_s < STOP_REPEAT_S:
+                return
+            self._sent_s = now_s
+            self.sent += 1
+        # A line that is gone: the control loop finds out and opens it again; we keep trying.
+        with contextlib.suppress(TransportError):
             self._write(framing.encode_stop(*pending))
-        except TransportError:
-            return  # the control loop finds out and opens the line again; we keep trying
 
-    def _repeat(self) -> None:
+    def _watch(self) -> None:
         while True:
             with self._changed:
                 self._changed.wait_for(lambda: self._closed or self._pending is not None)
                 self._changed.wait_for(lambda: self._closed, timeout=STOP_REPEAT_S)
                 if self._closed:
                     return
-                pending = self._pending
-            if pending is not None:
-                self._send(pending)
+            self.repeat_if_due()
 
 
 def _checked_um(positions_um: Mapping[str, int]) -> dict[str, int]:

@@ -43,6 +43,12 @@ class ServiceConfig(Section):
     prediction_gate_sigma: float = Field(
         default=5.0, gt=0, description="Refuse to go on when a move misses its prediction by more."
     )
+    settle_s: float = Field(
+        default=3.5,
+        ge=0,
+        description="Wait so long after a move before slices are asked for; must exceed the "
+        "uncertainty of the scanner's clock, else slices cannot be proved to belong here.",
+    )
     rescan_after_s: float = Field(
         default=60.0, gt=0, description="Ask for the slices again when none came for so long."
     )

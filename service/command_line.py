@@ -24,7 +24,7 @@ SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "service": ("service.processes:service", "Page, API, procedure, planner."),
     "bridge": ("robot_bridge.__main__:main", "The daemon in the scanner room."),
     "robot": ("robot_bridge.command_line:main", "Engineer's commands for bridge and motors."),
-    "scanner": ("simulator.command_line:app", "The virtual scanner alone."),
+    "scanner": ("simulator.command_line:scanner", "The virtual scanner alone."),
     "locate": ("service.locate:app", "Find the round objects in DICOM files."),
     "reconstruct": ("service.reconstruct_files:app", "Super-resolution image from DICOM files."),
     "study": ("studies.command_line:app", "The paper's studies, and ours beside them."),

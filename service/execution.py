@@ -187,6 +187,7 @@ class Execution:
     def _acquire(self, step: Acquire) -> Acquired:
         hold = self._hold_to_image(fresh=step.fresh)
         self._record.expect_slices(hold.hold_id, step.count)
+        self._let_clocks_agree(hold)
         attempt = 0
         while True:
             missing = step.count - len(self._record.slices(hold_id=hold.hold_id, state="assigned"))
@@ -201,6 +202,12 @@ class Execution:
             attempt += 1
         self.request = None
         return Acquired(hold.hold_id, step.count)
+
+    def _let_clocks_agree(self, hold: Hold) -> None:
+        """Ask for slices only when the hold is older than the scanner's clock is uncertain."""
+        while time.time() < hold.settled_at_s + self._config.service.settle_s:
+            self.prompt = "Standing still before the next slice."
+            self._wait()
 
     def _wait_for_slices(self, hold: Hold, missing: int) -> None:
         """Until the slices are there, or as many came but were set aside, or none for too long."""

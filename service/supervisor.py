@@ -1,4 +1,4 @@
-"""`autospine up`: listener, worker and service of the control-room computer under one supervisor."""
+"""`autospine up`: the control-room computer's listener, worker and service, supervised."""
 
 from __future__ import annotations
 

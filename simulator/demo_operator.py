@@ -111,7 +111,7 @@ class Operator:
             self._puncture(state)
         elif len(self.results) >= punctures:
             return False
-        elif not state["calibrated"]:
+        elif not state["calibrated"] or "calibrate again" in state["last_outcome"]:
             self._note_failure(state)
             self._post("/api/v1/calibration")
         else:

@@ -22,6 +22,7 @@ from simulator.truth_client import TruthAddress, TruthError, ask_where
 AXES = ("xt", "yt")
 _TRAVEL_MM = 20.0
 _CONFIG = "room.toml"
+_CLOCK_OFFSET_S = 37.2
 
 
 @dataclass(frozen=True)
@@ -137,14 +138,25 @@ class DemoRoom:
                 "listener_port": dicom_port,
                 "motors_truth_port": self.truth_port,
                 "truth_file": str(self.truth_file),
+                "clock_offset_s": _CLOCK_OFFSET_S,
             },
         }
         parse_virtual_room(self.virtual_table)
         line = self.virtual_dir / "line-service"
         tables = {
             "room": {"name": "virtual room", "case_dir": str(self.folder), "virtual": True},
-            "listener": {"port": dicom_port},
-            "service": {"port": page_port, "bridge_link": str(line), "confirm_moves": False},
+            "listener": {
+                "port": dicom_port,
+                # as if the clocks had been compared at the console, to a fiftieth of a second
+                "clock_offset_s": -_CLOCK_OFFSET_S,
+                "clock_uncertainty_s": 0.02,
+            },
+            "service": {
+                "port": page_port,
+                "bridge_link": str(line),
+                "confirm_moves": False,
+                "settle_s": 0.15,
+            },
             "virtual": {k: v for k, v in self.virtual_table.items() if k != "scanner"},
             "virtual.scanner": self.virtual_table["scanner"],
             "bridge": {

@@ -186,18 +186,13 @@ def localize_request(frames: Frames, method: str, request: Mapping[str, Any]) ->
         shift_sigma_px=float(request.get("shift_sigma_mm", 0.0)) / mean_mm,
     )
     if expected_px is not None and gate_px is not None and not near:
-        _refuse_outside_gate(np.asarray(found.centre_px), expected_px, gate_px)
+        miss_px = float(np.linalg.norm(np.asarray(found.centre_px) - expected_px))
+        if not miss_px <= gate_px:
+            raise OutsideGateError(
+                f"the round object found is {miss_px * mean_mm:.1f} mm from where the fiducial is "
+                f"expected; at most {gate_px * mean_mm:.1f} mm are believed"
+            )
     return found
-
-
-def _refuse_outside_gate(
-    centre_px: NDArray[np.float64], expected_px: NDArray[np.float64], gate_px: float
-) -> None:
-    distance_px = float(np.linalg.norm(centre_px - expected_px))
-    if not distance_px <= gate_px:
-        raise OutsideGateError(
-            f"object found {distance_px:.2f} px from where it was expected, allowed {gate_px:.2f}"
-        )
 
 
 def _plane_origin_mm(geometry: SliceGeometry) -> NDArray[np.float64]:

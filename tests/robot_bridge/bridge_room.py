@@ -57,7 +57,7 @@ class EmulatedControllers:
             EmulatedController(address, stage, Motor(), switches, time.monotonic(), 1.0)
             for address, stage in enumerate(self.stages.values(), start=1)
         ]
-        self.controllers = dict(zip(AXES, controllers, strict=True))
+        self.all = controllers
         bus = EmulatedBus(controllers, switches, random.Random(0))
         self._server = EmulatorServer(bus, PseudoTerminal())
         self.url = self._server.wire.url
@@ -71,7 +71,7 @@ class EmulatedControllers:
 
     @property
     def moving(self) -> bool:
-        return any(controller.moving for controller in self.controllers.values())
+        return any(controller.moving for controller in self.all)
 
     def positions_um(self) -> dict[str, float]:
         return {name: stage.position_um for name, stage in self.stages.items()}
@@ -90,6 +90,7 @@ class BridgeRoom:
     config_file: Path
     daemons: list[subprocess.Popen[str]] = field(default_factory=list)
     clients: list[BridgeClient] = field(default_factory=list)
+    outcomes: list[object] = field(default_factory=list)
 
     def start_daemon(self, *arguments: str) -> subprocess.Popen[str]:
         command = [sys.executable, "-m", "robot_bridge", "--config", str(self.config_file)]
