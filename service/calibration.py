@@ -81,6 +81,8 @@ def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
     before: FiducialEstimate | None = None
     plane: ImagePlane | None = None
     for number, setpoints_um in enumerate(places):
+        if number == len(places) - 1:
+            _check(jacobian)
         moved = yield from move(MoveTo(setpoints_um, f"calibration {number + 1}/{len(places)}"))
         expectation = _expectation(before, moved.readback_um, jacobian, arguments, number)
         _, measured = yield from measure_here("ml", expectation)
@@ -94,11 +96,15 @@ def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
         before = here
     assert before is not None
     assert plane is not None
+    _check(jacobian)
+    return (yield from _refine(before, jacobian, plane, measured, arguments))
+
+
+def _check(jacobian: ImageJacobian) -> None:
     try:
         jacobian.check()
     except CalibrationError as error:
         raise ProcedureFailedError("calibration", str(error)) from error
-    return (yield from _refine(before, jacobian, plane, measured, arguments))
 
 
 def learn_from_move(

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 import numpy as np
 import structlog
@@ -23,7 +23,9 @@ from dicom_listener.reasons import UnusableError
 from room_config.load import Config
 from sr_engine.errors import EngineError, OutsideGateError, SingularShiftSetError
 from sr_engine.geometry import SliceGeometry
+from sr_engine.hough import HoughSettings
 from sr_engine.localize import SEARCH_PX, Localization, localize
+from sr_engine.paper import PaperMethod, PaperSettings, localize_paper
 from sr_engine.reconstruct import reconstruct
 
 IMAGES = "images"
@@ -176,15 +178,27 @@ def localize_request(frames: Frames, method: str, request: Mapping[str, Any]) ->
         gate_px = float(request["gate_mm"]) / mean_mm
     # an expectation that is wider than the engine's own search only serves to refuse
     near = gate_px is not None and gate_px <= SEARCH_PX
-    found = localize(
-        frames.pixels,
-        frames.shifts_px,
-        start_px=expected_px if near else None,
-        gate_px=gate_px if near else None,
-        radius_px=(low_mm / mean_mm, high_mm / mean_mm),
-        method=method,
-        shift_sigma_px=float(request.get("shift_sigma_mm", 0.0)) / mean_mm,
-    )
+    radius_px = (low_mm / mean_mm, high_mm / mean_mm)
+    start_px, start_gate_px = (expected_px, gate_px) if near else (None, None)
+    if method in get_args(PaperMethod):
+        found = localize_paper(
+            frames.pixels,
+            frames.shifts_px,
+            cast(PaperMethod, method),
+            start_px=start_px,
+            gate_px=start_gate_px,
+            settings=PaperSettings(HoughSettings(radius_px)),
+        )
+    else:
+        found = localize(
+            frames.pixels,
+            frames.shifts_px,
+            start_px=start_px,
+            gate_px=start_gate_px,
+            radius_px=radius_px,
+            method=method,
+            shift_sigma_px=float(request.get("shift_sigma_mm", 0.0)) / mean_mm,
+        )
     if expected_px is not None and gate_px is not None and not near:
         miss_px = float(np.linalg.norm(np.asarray(found.centre_px) - expected_px))
         if not miss_px <= gate_px:

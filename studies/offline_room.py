@@ -107,6 +107,10 @@ class OfflineRoom:
             axis: PiezoLegsStage(stages, 0.0, random.Random(f"{seed}/{axis}")) for axis in axes
         }
         self.setpoints_um = dict.fromkeys(axes, 0)
+        # what the bridge is configured with, whatever the motors really are
+        self.nominal_step_um = dict.fromkeys(axes, stages.step_um)
+        self.nominal_mounting = dict.fromkeys(axes, stages.mounting)
+        self.stop_next_moves = 0
         self.moves: list[dict[str, int]] = []
         self.frames = 0
         self.scan_s = 0.0
@@ -145,12 +149,20 @@ class OfflineRoom:
         return Answered(self._answer(step), "operator")
 
     def _move(self, step: MoveTo) -> Moved:
-        for axis, setpoint_um in step.setpoints_um.items():
-            drive(self.stages[axis], setpoint_um - self.setpoints_um[axis])
-            self.setpoints_um[axis] = setpoint_um
         self.moves.append(dict(step.setpoints_um))
+        reached = 1.0
+        if self.stop_next_moves:
+            self.stop_next_moves -= 1
+            reached = 0.5
+        for axis, setpoint_um in step.setpoints_um.items():
+            change_um = round(reached * (setpoint_um - self.setpoints_um[axis]))
+            steps = change_um * self.nominal_mounting[axis] / self.nominal_step_um[axis]
+            drive(self.stages[axis], steps)
+            self.setpoints_um[axis] += change_um
         hold_id = max(self._slices) + 1
         self._slices[hold_id] = []
+        if reached < 1.0:
+            return Moved("STOPPED", "stopped", "STOP", hold_id, dict(self.setpoints_um))
         return Moved("DONE", "", "", hold_id, dict(self.setpoints_um))
 
     def _acquire(self, step: Acquire) -> Acquired:
@@ -203,14 +215,14 @@ class OfflineRoom:
         return measured_from_result(self._measurements, describe_result(frames, found))
 
 
-def drive(stage: PiezoLegsStage, change_um: float) -> None:
-    """One open-loop run, counted in steps of the nominal length."""
-    if change_um == 0:
+def drive(stage: PiezoLegsStage, steps: float) -> None:
+    """One open-loop run of so many waveform steps; the sign is the motor's direction."""
+    microsteps = round(steps * MICROSTEPS_PER_STEP)
+    if microsteps == 0:
         return
-    steps = change_um * stage.parameters.mounting / stage.parameters.step_um
     stage.unpark()
     stage.begin_run()
-    stage.drive(round(steps * MICROSTEPS_PER_STEP), _DRIVE_HZ)
+    stage.drive(microsteps, _DRIVE_HZ)
     stage.park()
 
 
