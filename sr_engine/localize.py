@@ -28,11 +28,12 @@ from sr_engine.errors import (
     OutsideGateError,
     ParameterError,
 )
-from sr_engine.fit import DiscFit, Pixels, fit_disc
+from sr_engine.fit import DiscFit, fit_disc
 from sr_engine.match import best_matches, correlate, radius_grid
 from sr_engine.model import DISC, Patch, Shape
 from sr_engine.noise import NoiseKind
 from sr_engine.psf import Psf
+from sr_engine.signal import Pixels
 
 Array = NDArray[np.float64]
 
@@ -122,13 +123,15 @@ def localize(
 
     guess = _first_guess(stack[0], start, shifts[0], radii)
     fits: list[DiscFit] = []
+    bounds = (0.8 * radii[0], 1.2 * radii[1])
     for frame, shift in zip(stack, shifts, strict=True):
         begin = (guess[0] + shift[0], guess[1] + shift[1], guess[2])
         pixels = region_of_interest(frame, begin, psf)
         refuse_saturated(pixels.values, guess[2], saturation_level)
-        bounds = (0.8 * radii[0], 1.2 * radii[1])
+        # the first frame tells the others all but the place
+        like = fits[-1].moved_to(np.array(begin[:2])) if fits else begin
         fit = fit_disc(
-            pixels, begin, psf, radius_bounds_px=bounds, shape=shape,
+            pixels, like, psf, radius_bounds_px=bounds, shape=shape,
             noise=noise, sigma=sigma, robust=robust,
         )  # fmt: skip
         _refuse_doubtful(fit, begin, frame.shape)
@@ -202,7 +205,7 @@ def _search_near(
     reach = int(np.ceil(radii[1] + MARGIN_PX + SEARCH_PX))
     r0, c0 = (max(0, round(x) - reach) for x in expected)
     part = frame[r0 : round(expected[0]) + reach + 1, c0 : round(expected[1]) + reach + 1]
-    grid = radius_grid(*radii)
+    grid = radius_grid(*radii, step_px=1.0)
     scores = correlate(part, grid)
     rows, cols = np.indices(part.shape)
     far = np.hypot(rows + r0 - expected[0], cols + c0 - expected[1]) > SEARCH_PX
@@ -272,7 +275,7 @@ def _combine(fits: list[DiscFit], shifts: Array, psf: Psf, shift_sigma_px: float
         covariance_px2=covariance,
         radius_px=float(np.mean([fit.radius_px for fit in fits])),
         amplitude=float(np.mean([fit.amplitude for fit in fits])),
-        background=float(np.mean([fit.parameters[4] for fit in fits])),
+        background=float(np.mean([fit.background for fit in fits])),
         snr=float(np.mean([fit.snr for fit in fits])),
         sigma=float(np.mean([fit.sigma for fit in fits])),
         chi2_per_dof=chi2_per_dof,

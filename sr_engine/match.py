@@ -64,10 +64,8 @@ def correlate(frame: Array, radii_px: Array) -> Array:
     floor = 1e-12 * float(np.mean(padded**2)) + 1e-300
     for i, radius in enumerate(radii_px):
         template, support, energy, area = _template_spectra((shape[0], shape[1]), float(radius))
-        signal, level, power = (
-            scipy.fft.irfft2(product, shape)[rows, cols]
-            for product in (image * template, image * support, square * support)
-        )
+        products = np.stack([image * template, image * support, square * support])
+        signal, level, power = scipy.fft.irfft2(products, shape)[:, rows, cols]
         spread = np.maximum(power - level**2 / area, area * floor)
         scores[i] = signal / np.sqrt(energy * spread)
     return scores
@@ -93,11 +91,11 @@ def best_matches(scores: Array, radii_px: Array, count: int, apart_px: float) ->
     return matches
 
 
-def radius_grid(low_px: float, high_px: float) -> Array:
-    """Radii from low to high, half a pixel or 6 % apart, whichever is more."""
+def radius_grid(low_px: float, high_px: float, step_px: float = 0.5) -> Array:
+    """Radii from low to high, step_px or 6 % apart, whichever is more."""
     radii = [low_px]
     while radii[-1] < high_px:
-        radii.append(min(radii[-1] + max(0.5, 0.06 * radii[-1]), high_px))
+        radii.append(min(radii[-1] + max(step_px, 0.06 * radii[-1]), high_px))
     return np.array(radii)
 
 

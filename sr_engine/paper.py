@@ -9,7 +9,7 @@ no error estimate of its own; the covariance reported is the paper's measured me
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal, get_args
 
 import numpy as np
@@ -54,9 +54,9 @@ class PaperSettings:
     ``sr_engine.ibp.PAPER`` is the paper's rule to the letter.
     """
 
-    hough: HoughSettings = HoughSettings(DEFAULT_RADII_PX)
+    hough: HoughSettings = field(default_factory=lambda: HoughSettings(DEFAULT_RADII_PX))
     factor: int = 2
-    blur: Blur = Blur(box=True)
+    blur: Blur = field(default_factory=lambda: Blur(box=True))
     stopping: Stopping | None = None
 
 

@@ -29,6 +29,7 @@ from sr_engine.paper import PaperMethod, PaperSettings, localize_paper
 from sr_engine.reconstruct import reconstruct
 
 IMAGES = "images"
+ALIVE = "worker.alive"
 _SAME_PLACE = 1e-6
 log = structlog.get_logger()
 
@@ -55,9 +56,14 @@ class Frames:
 
 
 def serve(config: Config, should_stop: Callable[[], bool]) -> None:
-    """Work until `should_stop`; looks for requests every `poll_s`."""
+    """Work until `should_stop`; looks for requests every `poll_s`, says every second: alive."""
+    alive = config.room.case_dir / ALIVE
+    said_s = 0.0
     with CaseRecord(config.room.case_dir, create=True) as record:
         while not should_stop():
+            if time.monotonic() - said_s > 1.0:
+                alive.touch()
+                said_s = time.monotonic()
             for request in record.requested_measurements():
                 measure(record, request, config.worker.reconstruction_factor)
             time.sleep(config.worker.poll_s)
