@@ -154,9 +154,7 @@ def describe_result(frames: Frames, found: Localization) -> dict[str, Any]:
             "col_direction": list(geometry.col_direction),
             "spacing_mm": list(geometry.spacing_mm),
         },
-        "scan_s": float(
-            sum((s.acquired_to_s or 0.0) - (s.acquired_from_s or 0.0) for s in frames.slices)
-        ),
+        "scan_s": sum(_scan_s(row.header) for row in frames.slices),
     }
 
 
