@@ -158,6 +158,12 @@ def describe_result(frames: Frames, found: Localization) -> dict[str, Any]:
     }
 
 
+def _scan_s(header: Mapping[str, Any]) -> float:
+    """How long the scanner took for this slice, by its own clock; 0 where it does not say."""
+    interval = header.get("interval")
+    return float(interval["end_s"] - interval["start_s"]) if interval else 0.0
+
+
 def _code_of(error: EngineError | UnusableSlicesError | UnusableError) -> str:
     if isinstance(error, UnusableSlicesError):
         return error.code
