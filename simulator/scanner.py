@@ -28,7 +28,7 @@ from simulator.truth_client import TruthAddress, TruthError, ask_path, ask_where
 
 Note = Callable[[str], None]
 
-_HELD_BACK_AT_MOST_S = 5.0
+_HELD_BACK_AT_MOST_S = 2.5
 _DUPLICATE_AFTER_S = 0.1
 
 
@@ -294,8 +294,13 @@ def read_request(http: httpx.Client, service_url: str) -> AcquisitionRequest | N
         raise ValueError(f"acquisition_request.{key}: {first['msg']}") from None
 
 
-def operate(room: VirtualRoom, stop: threading.Event, note: Note) -> None:
-    """Play the scanner and its operator until `stop` is set.
+def operate(
+    room: VirtualRoom,
+    stop: threading.Event,
+    note: Note,
+    ready: Callable[[], None] = lambda: None,
+) -> None:
+    """Play the scanner and its operator until `stop` is set; `ready` is called once it begins.
 
     Raises VirtualRoomError if the room has no scanner or the truth file cannot be written.
     """
@@ -313,6 +318,7 @@ def operate(room: VirtualRoom, stop: threading.Event, note: Note) -> None:
     served: set[str] = set()
     with httpx.Client(timeout=2.0, trust_env=False) as http, Outbox(settings, report) as outbox:
         scanner = VirtualScanner(room, truth, outbox, say)
+        ready()
         while not stop.wait(settings.poll_s):
             try:
                 request = read_request(http, settings.service_url)
