@@ -21,6 +21,7 @@ from pydicom.dataset import Dataset
 
 from simulator.config import ScannerSettings, VirtualRoom, VirtualRoomError
 from simulator.dicom_writer import AcquisitionStamp, Series, Study, write_mr_image
+from simulator.enhanced_writer import write_enhanced_mr_image
 from simulator.faults import corrupt, distorted, jumped_clock_s, phase_of, strike
 from simulator.mr_slice import AcquiredSlice, StagePath, acquire
 from simulator.outbox import Delivery, Outbox
@@ -230,7 +231,9 @@ class VirtualScanner:
             instance_number=scan.index + 1,
             reconstructed_s=self.clock_s(scan.ended_s) + self._settings.reconstruction_s,
         )
-        return write_mr_image(
+        enhanced = self._settings.sop_class == "enhanced"
+        write = write_enhanced_mr_image if enhanced else write_mr_image
+        return write(
             pixels,
             scan.slice.geometry,
             protocol=(room or self._room).protocol,
