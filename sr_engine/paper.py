@@ -42,6 +42,9 @@ DEFAULT_RADII_PX = (2.0, 12.0)
 SEARCH_PX = 3.0
 MARGIN_PX = 6.0
 AMBIGUOUS_RATIO = 0.95
+MIN_CONTRAST = 2.5
+"""Of the disc against its surroundings, in standard deviations of the noise: a Hough transform
+finds circles in noise as well."""
 MAX_RESIDUAL_PX = 1.0
 """A frame whose own circle lies farther off than this was not taken at its shift."""
 
@@ -251,6 +254,11 @@ def _localization(
     single = sigma_px("base" if method == "base" else "bicubic")
     inside, outside = _levels(stack[0], centre + shifts[0], radius)
     sigma = estimate_noise_sigma(stack)
+    if not abs(inside - outside) >= MIN_CONTRAST * sigma:
+        raise NoRoundObjectError(
+            f"the circle at row {centre[0]:.1f}, col {centre[1]:.1f} does not stand out from the "
+            f"noise (contrast {abs(inside - outside):.3g}, noise {sigma:.3g})"
+        )
     return Localization(
         centre_px=centre,
         covariance_px2=np.eye(2) * sigma_px(method) ** 2 / used,
