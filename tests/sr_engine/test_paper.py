@@ -16,10 +16,12 @@ from sr_engine.errors import (
     ObjectAtBorderError,
     OutsideGateError,
     ParameterError,
+    SaturatedError,
     ShapeError,
 )
 from sr_engine.hough import HoughSettings
 from sr_engine.ibp import PAPER
+from sr_engine.localize import localize
 from sr_engine.paper import PaperSettings, localize_paper, sigma_px
 from sr_engine.simulate import render_disc, rician
 
@@ -44,13 +46,28 @@ def test_each_method_finds_the_centre_in_the_reference_pose(
 ) -> None:
     # Displacements of more than the tolerance: a wrong sign would show.
     shifts = shiftset.paper_random(np.random.default_rng(3)).as_array() + np.array([0.9, -0.7])
-    found = localize_paper(_frames(shifts), shifts, method, start_px=start, settings=SETTINGS)  # type: ignore[arg-type]
+    found = localize_paper(_frames(shifts), shifts, method, start_px=start, settings=SETTINGS)
     assert math.dist(found.centre_px, CENTRE) < 0.25
     assert found.radius_px == pytest.approx(5.0, abs=1.0)
     assert found.snr == pytest.approx(20.0, rel=0.5)
     assert (found.method, found.n_frames) == (method, 4)
     assert found.residuals_px.shape == (4, 2)
     assert (np.linalg.eigvalsh(found.covariance_px2) > 0).all()
+
+
+@pytest.mark.parametrize("method", ["base", "bicubic", "sr"])
+def test_localize_hands_the_papers_methods_on(method: str) -> None:
+    shifts = shiftset.paper_random(np.random.default_rng(3)).as_array()
+    frames = _frames(shifts)
+    found = localize(frames, shifts, method=method, start_px=CENTRE, radius_px=(3.0, 7.0))
+    assert found.method == method
+    assert math.dist(found.centre_px, CENTRE) < 0.25
+    with pytest.raises(OutsideGateError):
+        localize(frames, shifts, method=method, start_px=CENTRE + 1.5, gate_px=0.5)
+    with pytest.raises(SaturatedError):
+        localize(frames, shifts, method=method, start_px=CENTRE, saturation_level=0.8)
+    with pytest.raises(ParameterError, match="known: ml, sr, bicubic, base"):
+        localize(frames, shifts, method="median")
 
 
 def test_one_frame_needs_no_shift() -> None:
@@ -109,7 +126,7 @@ def test_noise_alone_has_no_circle_near_the_start(method: str) -> None:
     frames = rician(np.zeros((4, *SHAPE)), 1.0, np.random.default_rng(0))
     shifts = shiftset.named("quarter").as_array()
     with pytest.raises((NoRoundObjectError, InconsistentFramesError)):
-        localize_paper(frames, shifts, method, start_px=CENTRE, settings=SETTINGS)  # type: ignore[arg-type]
+        localize_paper(frames, shifts, method, start_px=CENTRE, settings=SETTINGS)
 
 
 @pytest.mark.parametrize(
@@ -132,6 +149,6 @@ def test_bad_frames_give_a_typed_reason(
 
 def test_an_unknown_method_and_a_start_that_is_none_are_refused() -> None:
     with pytest.raises(ParameterError, match="'median'; base, bicubic or sr"):
-        localize_paper(np.ones(SHAPE), None, "median")  # type: ignore[arg-type]
+        localize_paper(np.ones(SHAPE), None, "median")
     with pytest.raises(ParameterError, match="start_px"):
         localize_paper(np.ones(SHAPE), None, "base", start_px=(math.nan, 3.0))
