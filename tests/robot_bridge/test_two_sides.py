@@ -62,8 +62,10 @@ class TwoSides(RuleBasedStateMachine):
         self.sessions = itertools.count(100)
         self.boots = itertools.count(1)
         self.service = ServiceEnd()
-        self.to_bridge: list[bytes] = []
+        self.to_bridge: list[bytes] = []  # on the way
         self.to_service: list[bytes] = []
+        self.ever_to_bridge: list[bytes] = []  # may come again at any time
+        self.ever_to_service: list[bytes] = []
         self.executed: Counter[str] = Counter()
         self.executed_in: dict[str, int] = {}
         self.sent_in: dict[str, int] = {}
@@ -106,7 +108,7 @@ class TwoSides(RuleBasedStateMachine):
     def send_stop(self, emergency: bool) -> None:
         nonce = next(self.numbers)
         self.stops_sent.add(nonce)
-        self.to_bridge.append(framing.encode_stop(nonce, emergency))
+        self._on_its_way(framing.encode_stop(nonce, emergency))
 
     @rule(seconds=st.sampled_from([0.01, 0.2, 1.0]))
     def wait(self, seconds: float) -> None:
@@ -129,34 +131,50 @@ class TwoSides(RuleBasedStateMachine):
     def _flush_service(self) -> None:
         output = self.service.take_output()
         if output:
-            self.to_bridge.append(output)
+            self._on_its_way(output)
+
+    def _on_its_way(self, frame: bytes) -> None:
+        self.to_bridge.append(frame)
+        self.ever_to_bridge.append(frame)
 
     # --- the line acts ------------------------------------------------------------------------
 
-    @precondition(lambda self: self.to_bridge)
-    @rule(data=st.data(), keep=st.booleans())
-    def deliver_to_bridge(self, data: st.DataObject, keep: bool) -> None:
-        place = data.draw(st.integers(0, len(self.to_bridge) - 1))
-        frame = self.to_bridge[place] if keep else self.to_bridge.pop(place)
-        self._bridge_receives(frame)
+    @rule()
+    def everything_arrives(self) -> None:
+        self._exchange()
 
-    @precondition(lambda self: len(self.to_bridge) > 1)
-    @rule(data=st.data())
-    def deliver_several_at_once(self, data: st.DataObject) -> None:
-        several = data.draw(st.lists(st.sampled_from(self.to_bridge), min_size=2, max_size=5))
-        self._bridge_receives(b"".join(several))
+    @precondition(lambda self: self.to_bridge)
+    @rule(data=st.data(), lost=st.booleans())
+    def one_frame_arrives_or_is_lost(self, data: st.DataObject, lost: bool) -> None:
+        place = data.draw(st.integers(0, len(self.to_bridge) - 1))
+        frame = self.to_bridge.pop(place)
+        if not lost:
+            self._bridge_receives(frame)
 
     @precondition(lambda self: self.to_service)
-    @rule(data=st.data(), keep=st.booleans())
-    def deliver_to_service(self, data: st.DataObject, keep: bool) -> None:
+    @rule(data=st.data(), lost=st.booleans())
+    def one_answer_arrives_or_is_lost(self, data: st.DataObject, lost: bool) -> None:
         place = data.draw(st.integers(0, len(self.to_service) - 1))
-        frame = self.to_service[place] if keep else self.to_service.pop(place)
-        self._service_receives(frame)
+        frame = self.to_service.pop(place)
+        if not lost:
+            self._service_receives(frame)
+
+    @precondition(lambda self: self.ever_to_bridge)
+    @rule(back=st.lists(st.integers(1, 12), min_size=1, max_size=5))
+    def old_frames_arrive_again_in_one_read(self, back: list[int]) -> None:
+        ever = self.ever_to_bridge
+        self._bridge_receives(b"".join(ever[-min(n, len(ever))] for n in back))
+
+    @precondition(lambda self: self.ever_to_service)
+    @rule(back=st.integers(1, 12))
+    def an_old_answer_arrives_again(self, back: int) -> None:
+        ever = self.ever_to_service
+        self._service_receives(ever[-min(back, len(ever))])
 
     @precondition(lambda self: self.to_bridge)
     @rule(data=st.data())
     def damage(self, data: st.DataObject) -> None:
-        raw = bytearray(data.draw(st.sampled_from(self.to_bridge)))
+        raw = bytearray(self.to_bridge[data.draw(st.integers(0, len(self.to_bridge) - 1))])
         place = data.draw(st.integers(1, len(raw) - 2))
         raw[place] ^= 1 << data.draw(st.integers(0, 7))
         heard = set(self.stops_heard)
@@ -204,6 +222,7 @@ class TwoSides(RuleBasedStateMachine):
         output = self.bridge.take_output()
         if output:
             self.to_service.append(output)
+            self.ever_to_service.append(output)
 
     def _execute(self, event: RequestReceived) -> None:
         assert isinstance(event.request, Disarm)
@@ -267,19 +286,24 @@ class TwoSides(RuleBasedStateMachine):
         self._exchange()
         assert self.service.session == self.bridge.session is not None
         self.send_request()
-        name = self.asked
+        name = str(self.asked)
+        for frame in self.to_bridge:
+            self._bridge_receives(frame)
+        self.to_bridge.clear()
+        self.to_service.clear()  # the answer is lost
+        assert name not in self.answered
+        self.wait(1.0)
         self._exchange()
-        assert self.answered[str(name)] == name
+        assert self.answered[name] == name
         self.every_request_is_executed_at_most_once()
 
     def _exchange(self) -> None:
-        for _ in range(3):
-            for frame in self.to_bridge:
-                self._bridge_receives(frame)
-            self.to_bridge.clear()
-            for frame in self.to_service:
-                self._service_receives(frame)
-            self.to_service.clear()
+        for frame in [*self.to_bridge]:
+            self._bridge_receives(frame)
+        self.to_bridge.clear()
+        for frame in [*self.to_service]:
+            self._service_receives(frame)
+        self.to_service.clear()
 
 
 TwoSides.TestCase.settings = settings(max_examples=120, stateful_step_count=50, deadline=None)
