@@ -52,12 +52,18 @@ class StepCalibration:
         forward_um, reverse_um = self.forward.step_um, self.reverse.step_um
         return 2 * (forward_um - reverse_um) / (forward_um + reverse_um)
 
-    def toml_lines(self) -> str:
-        """For the axis's table in the room's file."""
-        return (
-            f"step_um_forward = {self.forward.step_um:.4f}\n"
-            f"step_um_reverse = {self.reverse.step_um:.4f}\n"
-        )
+    def as_fields(self) -> dict[str, object]:
+        """The two step lengths under their names in the axis's table of the room's file."""
+        return {
+            "axis": self.axis,
+            "step_um_forward": round(self.forward.step_um, 4),
+            "step_um_forward_sigma": round(self.forward.sigma_um, 4),
+            "step_um_reverse": round(self.reverse.step_um, 4),
+            "step_um_reverse_sigma": round(self.reverse.sigma_um, 4),
+            "scatter_forward": round(self.forward.scatter, 5),
+            "scatter_reverse": round(self.reverse.scatter, 5),
+            "asymmetry": round(self.asymmetry, 5),
+        }
 
 
 def step_lengths(axis: str, sign: int, readings: Sequence[StepReading]) -> StepCalibration:
@@ -111,28 +117,24 @@ def calibrate_steps(
     *,
     steps: int,
     runs: int,
-    read_um: Callable[[], float] | None = None,
+    read_um: Callable[[str], float] | None = None,
     deadline_s: float = 60.0,
-    rest: Callable[[], None] = lambda: None,
 ) -> StepCalibration:
     """Run `steps` forward and back, `runs` times, and measure every run.
 
-    read_um: position along the axis from an instrument; without it the axis's own encoder is read.
-    rest: called before each reading (to wait, or to ask the engineer to read a gauge).
+    read_um: position along the axis from an instrument, told what for ("before +500 steps");
+    without it the axis's own encoder is read. The motors must be open.
     Raises MotorError (nothing further moves) and CalibrationError.
     """
     if read_um is None and axis.drive != "closed_loop":
         raise CalibrationError(f"axis {axis.name} has no encoder: give it readings")
+    where_um = read_um or (lambda what: motors.measure_um(axis.name))
     readings = []
-    rest()
-    before_um = (read_um or (lambda: motors.measure_um(axis.name)))()
     for run in range(2 * runs):
         signed = steps if run % 2 == 0 else -steps
+        before_um = where_um(f"before {signed:+d} steps")
         _run_to_end(motors, axis.name, signed, deadline_s)
-        rest()
-        after_um = (read_um or (lambda: motors.measure_um(axis.name)))()
-        readings.append(StepReading(signed, after_um - before_um))
-        before_um = after_um
+        readings.append(StepReading(signed, where_um(f"after {signed:+d} steps") - before_um))
     return step_lengths(axis.name, axis.sign, readings)
 
 

@@ -397,9 +397,12 @@ def _check_setpoint(axis: AxisConfig, setpoint_um: int) -> None:
 
 
 def _check_run(axis: PmdAxis, steps: int) -> None:
+    """An open-loop axis whose position nobody declared has none to check: the engineer looks."""
     config = axis.config
     if not isinstance(steps, int) or steps == 0:
         raise MotorError("bad_run", f"axis {config.name}: a run of {steps!r} steps")
+    if not (axis.closed_loop or axis.certain):
+        return
     reach_um = 2 * abs(steps) * max(config.step_um_forward, config.step_um_reverse)
     direction = config.sign * (1 if steps > 0 else -1)
     end_um = axis.readback_um() + direction * reach_um

@@ -451,6 +451,8 @@ class PmdAxis:
             self.certain = False
         yield from self._read_position()
         self._at_rest_um = self.position_um
+        if not status & (ERRORS | Status.RESET | Status.OVERHEAT | Status.EXTERNAL_LIMIT):
+            self.fault = None
 
 
 class _ProgressWatch:
