@@ -269,12 +269,7 @@ def measure_steps(args: argparse.Namespace, config: BridgeConfig) -> None:
         if read_um is None:
             _check_room_for(axis, motors.measure_um(axis.name), args.steps)
         measured = calibrate_steps(motors, axis, steps=args.steps, runs=args.runs, read_um=read_um)
-    fields: dict[str, object] = {"axis": axis.name, "asymmetry": round(measured.asymmetry, 4)}
-    for direction in ("forward", "reverse"):
-        length = getattr(measured, direction)
-        fields[f"step_um_{direction}"] = round(length.step_um, 4)
-        fields[f"sigma_um_{direction}"] = round(length.sigma_um, 4)
-    _print(args, fields)
+    _print(args, measured.as_fields())
 
 
 def _check_room_for(axis: AxisConfig, here_um: float, steps: int) -> None:
@@ -298,12 +293,12 @@ def _require_direct(args: argparse.Namespace, why: str) -> None:
         raise UsageError(f"{args.command} {why}: it needs --direct, and no bridge running")
 
 
-def _ask_for_um() -> float:
+def _ask_for_um(what: str) -> float:
     if not sys.stdin.isatty():
         raise UsageError("an axis without encoder is measured by you: run this on a terminal")
     while True:
         with contextlib.suppress(ValueError):
-            return float(input("gauge reading along the axis, mm: ")) * 1000.0
+            return float(input(f"{what}: gauge reading along the axis, mm: ")) * 1000.0
 
 
 def capture(args: argparse.Namespace, config: BridgeConfig) -> None:
