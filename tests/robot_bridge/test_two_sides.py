@@ -83,7 +83,11 @@ class TwoSides(RuleBasedStateMachine):
 
     # --- the service acts ---------------------------------------------------------------------
 
-    @rule()
+    @rule(dice=st.integers(0, 3))
+    def say_hello_now_and_then(self, dice: int) -> None:
+        if dice == 3:
+            self.say_hello()
+
     def say_hello(self) -> None:
         self.service.say_hello(next(self.numbers), "test", self.now_s)
         self._forget_request()
@@ -118,8 +122,10 @@ class TwoSides(RuleBasedStateMachine):
             self._forget_request()
         self._flush_service()
 
-    @rule()
-    def service_restarts(self) -> None:
+    @rule(dice=st.integers(0, 3))
+    def service_restarts(self, dice: int) -> None:
+        if dice != 3:  # often enough, or no session gets old
+            return
         self.service = ServiceEnd()
         self._forget_request()
 
@@ -142,6 +148,17 @@ class TwoSides(RuleBasedStateMachine):
     @rule()
     def everything_arrives(self) -> None:
         self._exchange()
+
+    @rule(requests=st.integers(1, 4))
+    def a_while_on_a_good_line(self, requests: int) -> None:
+        self._exchange()
+        if self.service.session is None:
+            self.say_hello()
+            self._exchange()
+        for _ in range(requests):
+            if self.service.session is not None and not self.service.busy:
+                self.send_request()
+                self._exchange()
 
     @precondition(lambda self: self.to_bridge)
     @rule(data=st.data(), lost=st.booleans())
@@ -197,8 +214,10 @@ class TwoSides(RuleBasedStateMachine):
 
     # --- the bridge acts ----------------------------------------------------------------------
 
-    @rule()
-    def bridge_restarts(self) -> None:
+    @rule(dice=st.integers(0, 3))
+    def bridge_restarts(self, dice: int) -> None:
+        if dice != 3:
+            return
         self._boot()
 
     def _bridge_receives(self, data: bytes) -> None:
