@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -95,8 +95,10 @@ class BridgeRoom:
     clients: list[BridgeClient] = field(default_factory=list)
     outcomes: list[object] = field(default_factory=list)
 
-    def start_daemon(self, *arguments: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "robot_bridge", "--config", str(self.config_file)]
+    def start_daemon(
+        self, *arguments: str, python: Sequence[str] = (sys.executable, "-m", "robot_bridge")
+    ) -> subprocess.Popen[str]:
+        command = [*python, "--config", str(self.config_file)]
         log = (self.folder / f"daemon-{len(self.daemons)}.log").open("w")
         with log:
             daemon = subprocess.Popen(
