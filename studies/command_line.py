@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -67,6 +68,9 @@ def _run_numerical(
     as_json: bool,
     scheduler: str | None,
 ) -> None:
+    # The matrices are small: threads would only wait for each other. Before numpy is loaded.
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     # Loaded here, so that the command's help costs nothing.
     from rich.console import Console
 
