@@ -154,10 +154,14 @@ def describe_result(frames: Frames, found: Localization) -> dict[str, Any]:
             "col_direction": list(geometry.col_direction),
             "spacing_mm": list(geometry.spacing_mm),
         },
-        "scan_s": float(
-            sum((s.acquired_to_s or 0.0) - (s.acquired_from_s or 0.0) for s in frames.slices)
-        ),
+        "scan_s": sum(_scan_s(row.header) for row in frames.slices),
     }
+
+
+def _scan_s(header: Mapping[str, Any]) -> float:
+    """How long the scanner took for this slice, by its own clock; 0 where it does not say."""
+    interval = header.get("interval")
+    return float(interval["end_s"] - interval["start_s"]) if interval else 0.0
 
 
 def _code_of(error: EngineError | UnusableSlicesError | UnusableError) -> str:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from listener_room import a_slice
 
 from dicom_listener.assign import Assigned, AssignRules, HoldWindow, Known, Pending, assign
-from dicom_listener.clock import ClockRules, ScannerClock, Sync, observe
+from dicom_listener.clock import ClockRules, OffsetBounds, ScannerClock, Sync, observe
 from dicom_listener.header import Slice
 from dicom_listener.times import AcquisitionInterval
 
@@ -57,11 +57,13 @@ class VirtualDay:
 
     prompt_s = 2.0
 
-    def __init__(self, dice: random.Random, trouble: Trouble) -> None:
+    def __init__(self, dice: random.Random, trouble: Trouble, *, ask_after_s: float = 0.0) -> None:
         self.dice, self.trouble = dice, trouble
+        self.ask_after_s = ask_after_s  # how long the robot stands before slices are asked for
         self.rules = AssignRules(guard_s=0.05, late_limit_s=120.0)
         self.clock_rules = ClockRules(prompt_delay_s=self.prompt_s, late_limit_s=120.0)
         self.offset_s = dice.uniform(-300, 300)  # our clock - the scanner's
+        self.first_offset_s = self.offset_s
         self.drift = dice.uniform(-20e-6, 20e-6)
         self.jumped_s: float | None = None  # a jump that no prompt slice has shown yet
         self.number = 0
@@ -110,7 +112,8 @@ class VirtualDay:
         return now_s
 
     def scan_some(self, now_s: float, count: int) -> float:
-        began_s = now_s + self.dice.uniform(-0.3 if self.chance("extra_scans") else 0.0, 3.0)
+        began_s = now_s + self.ask_after_s
+        began_s += self.dice.uniform(-0.3 if self.chance("extra_scans") else 0.0, 3.0)
         for _ in range(count):
             length_s = self.dice.uniform(0.1, 8.0)
             self.send(self.scan(began_s, length_s))
@@ -174,7 +177,7 @@ class VirtualDay:
         assert slice_.interval is not None
         seen = observe(self.clock, slice_.interval, arrival.received_s, self.clock_rules)
         self.clock = seen.clock
-        bounds = self.clock.bounds_for(slice_.interval, arrival.received_s, self.clock_rules)
+        bounds = self.bounds_of(arrival)
         holds = self.holds
         decision = assign(slice_, arrival.received_s, holds, self.known, bounds, self.rules)
         hold_id, code = None, ""
@@ -188,6 +191,10 @@ class VirtualDay:
             assert decision.text
             assert not isinstance(decision, Pending) or decision.code
         self.known.append(Known(slice_, arrival.received_s, hold_id, code))
+
+    def bounds_of(self, arrival: Arrival) -> OffsetBounds | None:
+        assert arrival.slice.interval is not None
+        return self.clock.bounds_for(arrival.slice.interval, arrival.received_s, self.clock_rules)
 
     def check(self, arrival: Arrival, hold_id: int) -> None:
         self.outcome.assigned += 1

@@ -61,7 +61,14 @@ def test_the_page_stays_up_until_ctrl_c_and_then_all_ends(demo):
         assert probe.connect_ex(("127.0.0.1", port)) != 0
 
 
-@pytest.mark.parametrize("victim", PROCESSES)
+@pytest.mark.parametrize(
+    "victim",
+    [
+        # the ones that hold the robot by default, every one in the long campaign
+        pytest.param(name, marks=() if name in ("bridge", "service") else pytest.mark.soak)
+        for name in PROCESSES
+    ],
+)
 def test_a_killed_process_ends_in_a_stopped_robot_and_the_case_goes_on(demo, victim):
     running = demo("--exit", "--punctures", "1", "--seed", "5")
     running.wait_for_event("move_sent")
