@@ -16,6 +16,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
+from case_record.presence import Presence
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
 from dicom_listener.pixels import magnitude_pixels
@@ -55,8 +56,10 @@ class Frames:
 
 def serve(config: Config, should_stop: Callable[[], bool]) -> None:
     """Work until `should_stop`; looks for requests every `poll_s`."""
-    with CaseRecord(config.room.case_dir, create=True) as record:
+    case_dir = config.room.case_dir
+    with CaseRecord(case_dir, create=True) as record, Presence(case_dir, "worker") as presence:
         while not should_stop():
+            presence.beat()
             for request in record.requested_measurements():
                 measure(record, request, config.worker.reconstruction_factor)
             time.sleep(config.worker.poll_s)
