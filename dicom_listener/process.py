@@ -76,7 +76,10 @@ def intake_rules(config: Config, now_s: float) -> IntakeRules:
             arrival_mode=listener.arrival_mode,
         ),
         clock=ClockRules(
-            prompt_delay_s=listener.prompt_delay_s, late_limit_s=listener.late_limit_s
+            prompt_delay_s=listener.prompt_delay_s,
+            longest_acquisition_s=listener.longest_acquisition_s,
+            largest_offset_s=listener.largest_clock_offset_s,
+            late_limit_s=listener.late_limit_s,
         ),
         zone=_zone(listener.scanner_time_zone),
         sync=sync,

@@ -1,41 +1,42 @@
 """Approach: measure, plan, move, until the fiducial is at the target with enough certainty.
 
-The `adaptive` strategy: one slice a place, every earlier measurement carried along through the
-known moves, and more slices at the same place only where the bound says that they will decide.
+How it looks is the strategy's (`service.looking`). `adaptive` carries every earlier measurement
+along through the known moves, plans from that, and takes more slices at one place only where the
+bound says that they will decide. The paper's strategies believe the last image alone, and their
+image Jacobian stays as it was calibrated.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from service.calibration import Calibration, learn_from_move
 from service.estimate import FiducialEstimate, MotionNoise, probability_within
+from service.looking import STRATEGIES, Look, LookArguments, Way, look_at_fiducial, look_longer
 from service.plan import Plan, PlanRefusedError, Travel, plan_move
-from service.plane import ImagePlane
-from service.sensing import (
-    Expectation,
-    ProcedureFailedError,
-    check_prediction,
-    estimate_from,
-    measure_again,
-    measure_here,
-    move,
-)
-from service.steps import Acquired, Answered, AskOperator, Measured, MoveTo, ProcedureSteps, ask
+from service.sensing import ProcedureFailedError, check_prediction, move
+from service.steps import Answered, AskOperator, Measured, MoveTo, ProcedureSteps, ask
 
 CONFIRM = "confirm"
 REJECT = "reject"
 _MOST_FRAMES = 6
 _WORTH_MORE_FRAMES = 0.6
+_LOOSE_MM = 0.25
+PROBABILITY, PAPER = "probability", "paper"
 
 
 @dataclass(frozen=True)
 class ApproachArguments:
-    """target_mm is in the image plane of the calibration."""
+    """What an approach is told.
+
+    target_mm: in the image plane of the calibration. stop_rule: `probability` (READY only with
+    P(error < tolerance) >= confidence) or `paper` (error below one pixel of the image looked at;
+    for the paper's studies). seed: of the random shift sets.
+    """
 
     target_mm: tuple[float, float]
     travel_um: Mapping[str, tuple[int, int]]
@@ -47,10 +48,17 @@ class ApproachArguments:
     gate_sigma: float
     repeatability_mm: float
     scale_error: float
+    strategy: str = "adaptive"
+    stop_rule: str = PROBABILITY
+    seed: int = 0
 
     @property
     def noise(self) -> MotionNoise:
         return MotionNoise(self.repeatability_mm, self.scale_error)
+
+    @property
+    def looking(self) -> LookArguments:
+        return LookArguments(self.position_gate_mm, self.gate_sigma, self.noise, self.seed)
 
     @property
     def travel(self) -> dict[str, Travel]:
@@ -77,77 +85,88 @@ class Arrival:
 
 @dataclass(frozen=True, eq=False)
 class _Standing:
-    """Where an approach stands after a measurement."""
+    """Where an approach stands.
+
+    seen: the last look, if the robot has not moved since; iterations: moves made so far.
+    """
 
     calibration: Calibration
-    acquired: Acquired
-    measured: Measured
-    prior: FiducialEstimate | None
-    frames: int
-    scan_s: float
+    seen: Look | None = None
+    looks: int = 0
+    frames: int = 0
+    scan_s: float = 0.0
+    iterations: int = 0
 
 
 def approach(arguments: ApproachArguments, start: Calibration) -> ProcedureSteps[Arrival]:
     """Bring the fiducial to the target; raises ProcedureFailedError when that does not succeed."""
-    standing = yield from _look(arguments, start, start.estimate, 0, 0.0)
-    for iteration in range(arguments.max_iterations + 1):
-        standing = yield from _more_frames(arguments, standing)
-        probability = _probability(arguments, standing.calibration.estimate)
-        if probability >= arguments.confidence:
-            return _arrival(arguments, standing, probability, iteration)
-        if iteration == arguments.max_iterations:
-            break
-        plan = _plan(arguments, standing, iteration)
+    strategy = STRATEGIES[arguments.strategy]
+    way = strategy.coarse
+    standing = _Standing(start)
+    if not strategy.fuses or _is_loose(arguments, start.estimate):
+        standing = yield from _look(arguments, standing, way)
+    while True:
+        if strategy.fuses:
+            standing = yield from _more_frames(arguments, standing)
+        if _is_there(arguments, standing, way):
+            if standing.seen is not None and way is strategy.fine:
+                return _arrival(arguments, standing)
+            # never READY on a prediction, nor (hybrid) on the coarse image
+            way = strategy.fine
+            standing = yield from _look(arguments, standing, way)
+            continue
+        if standing.iterations == arguments.max_iterations:
+            raise _not_converged(arguments, standing)
+        plan = _plan(arguments, standing)
         yield from _confirm(arguments, plan)
-        standing = yield from _go(arguments, standing, plan)
-    raise ProcedureFailedError(
-        "not_converged",
-        f"the target was not reached in {arguments.max_iterations} moves: the error is "
-        f"{np.linalg.norm(_error(arguments, standing.calibration.estimate)):.3f} mm",
+        standing = yield from _go(arguments, standing, plan, way)
+
+
+def _look(arguments: ApproachArguments, standing: _Standing, way: Way) -> ProcedureSteps[_Standing]:
+    """Look from where the robot stands; what was predicted must be what is seen."""
+    calibration = standing.calibration
+    look = yield from look_at_fiducial(
+        way,
+        calibration,
+        arguments.looking,
+        number=standing.looks,
+        fresh=standing.seen is not None or standing.iterations == 0,
     )
-
-
-def _look(
-    arguments: ApproachArguments,
-    calibration: Calibration,
-    predicted: FiducialEstimate,
-    frames: int,
-    scan_s: float,
-) -> ProcedureSteps[_Standing]:
-    expectation = Expectation.of(predicted, arguments.position_gate_mm, arguments.gate_sigma)
-    acquired, measured = yield from measure_here(predicted.setpoints_um, "ml", expectation)
-    if not ImagePlane.from_json(measured.plane).is_parallel_to(calibration.plane):
-        raise ProcedureFailedError(
-            "plane_changed", "the slice orientation is not that of the calibration"
-        )
-    check_prediction(predicted, measured, arguments.gate_sigma, arguments.noise)
-    fused = predicted.fused_with(np.array(measured.plane_mm), np.array(measured.covariance_mm2))
-    learnt = Calibration(calibration.jacobian, fused, calibration.plane, measured.measurement_id)
-    return _Standing(
-        learnt, acquired, measured, predicted, frames + measured.frames, scan_s + measured.scan_s
+    check_prediction(calibration.estimate, look.found, arguments.gate_sigma, arguments.noise)
+    estimate = look.found
+    if STRATEGIES[arguments.strategy].fuses:
+        estimate = calibration.estimate.fused_with(estimate.plane_mm, estimate.covariance_mm2)
+    return replace(
+        standing,
+        calibration=replace(
+            calibration, estimate=estimate, measurement_id=look.measured.measurement_id
+        ),
+        seen=look,
+        looks=standing.looks + 1,
+        frames=standing.frames + look.measured.frames,
+        scan_s=standing.scan_s + look.measured.scan_s,
     )
 
 
 def _more_frames(arguments: ApproachArguments, standing: _Standing) -> ProcedureSteps[_Standing]:
     """Take more slices here, if so many as are needed would make this the place to puncture."""
-    wanted = frames_that_decide(arguments, standing.calibration.estimate, standing.measured)
-    if wanted <= standing.measured.frames or standing.prior is None:
+    seen = standing.seen
+    if seen is None or seen.acquired is None:
         return standing
-    expectation = Expectation.of(standing.prior, arguments.position_gate_mm, arguments.gate_sigma)
-    acquired, measured = yield from measure_again(
-        standing.acquired, "ml", expectation, frames=wanted
-    )
-    fused = standing.prior.fused_with(
-        np.array(measured.plane_mm), np.array(measured.covariance_mm2)
-    )
-    calibration = standing.calibration
-    return _Standing(
-        Calibration(calibration.jacobian, fused, calibration.plane, measured.measurement_id),
-        acquired,
-        measured,
-        standing.prior,
-        standing.frames + measured.frames - standing.measured.frames,
-        standing.scan_s + measured.scan_s - standing.measured.scan_s,
+    wanted = frames_that_decide(arguments, standing.calibration.estimate, seen.measured)
+    if wanted <= seen.measured.frames:
+        return standing
+    more = yield from look_longer(seen, seen.acquired, arguments.looking, frames=wanted)
+    # from the prior again: the slices that are in both measurements count once
+    fused = seen.prior.fused_with(more.found.plane_mm, more.found.covariance_mm2)
+    return replace(
+        standing,
+        calibration=replace(
+            standing.calibration, estimate=fused, measurement_id=more.measured.measurement_id
+        ),
+        seen=more,
+        frames=standing.frames + more.measured.frames - seen.measured.frames,
+        scan_s=standing.scan_s + more.measured.scan_s - seen.measured.scan_s,
     )
 
 
@@ -169,34 +188,56 @@ def frames_that_decide(
     return measured.frames
 
 
-def _go(arguments: ApproachArguments, standing: _Standing, plan: Plan) -> ProcedureSteps[_Standing]:
+def _go(
+    arguments: ApproachArguments, standing: _Standing, plan: Plan, way: Way
+) -> ProcedureSteps[_Standing]:
+    """Carry out the plan, look, and learn from the move."""
     calibration = standing.calibration
-    before = estimate_from(standing.measured, calibration.estimate.setpoints_um)
+    before = calibration.estimate if standing.seen is None else standing.seen.found
     moved = yield from move(
         MoveTo(dict(plan.setpoints_um), "approach", rests_on=plan.measurement_id)
     )
     predicted = calibration.estimate.moved_to(
         moved.readback_um, calibration.jacobian, arguments.noise
     )
-    after = yield from _look(arguments, calibration, predicted, standing.frames, standing.scan_s)
-    jacobian = learn_from_move(
-        calibration.jacobian,
-        before,
-        estimate_from(after.measured, moved.readback_um),
-        arguments.noise,
+    there = replace(
+        standing,
+        calibration=replace(calibration, estimate=predicted),
+        seen=None,
+        iterations=standing.iterations + 1,
     )
-    learnt = Calibration(
-        jacobian,
-        after.calibration.estimate,
-        calibration.plane,
-        after.calibration.measurement_id,
-    )
-    return _Standing(
-        learnt, after.acquired, after.measured, after.prior, after.frames, after.scan_s
+    after = yield from _look(arguments, there, way)
+    if not STRATEGIES[arguments.strategy].fuses or after.seen is None:
+        return after
+    jacobian = learn_from_move(calibration.jacobian, before, after.seen.found, arguments.noise)
+    return replace(after, calibration=replace(after.calibration, jacobian=jacobian))
+
+
+def _is_loose(arguments: ApproachArguments, estimate: FiducialEstimate) -> bool:
+    """True if the start is known so badly that a plan from it would be a guess."""
+    worst_mm = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance_mm2)[-1]))
+    return worst_mm > max(_LOOSE_MM, arguments.tolerance_mm)
+
+
+def _is_there(arguments: ApproachArguments, standing: _Standing, way: Way) -> bool:
+    estimate = standing.calibration.estimate
+    if arguments.stop_rule == "probability":
+        return _probability(arguments, estimate) >= arguments.confidence
+    pixel_mm = np.array(standing.calibration.plane.spacing_mm) / way.factor
+    return float(np.linalg.norm(_error(arguments, estimate) / pixel_mm)) < 1.0
+
+
+def _not_converged(arguments: ApproachArguments, standing: _Standing) -> ProcedureFailedError:
+    error_mm = np.linalg.norm(_error(arguments, standing.calibration.estimate))
+    return ProcedureFailedError(
+        "not_converged",
+        f"the target was not reached in {arguments.max_iterations} moves: the error is "
+        f"{error_mm:.3f} mm, P(error < {arguments.tolerance_mm:g} mm) = "
+        f"{_probability(arguments, standing.calibration.estimate):.2f}",
     )
 
 
-def _plan(arguments: ApproachArguments, standing: _Standing, iteration: int) -> Plan:
+def _plan(arguments: ApproachArguments, standing: _Standing) -> Plan:
     calibration = standing.calibration
     try:
         return plan_move(
@@ -205,7 +246,7 @@ def _plan(arguments: ApproachArguments, standing: _Standing, iteration: int) -> 
             calibration.jacobian,
             arguments.travel,
             measurement_id=calibration.measurement_id,
-            plan_id=f"{calibration.measurement_id}.{iteration}",
+            plan_id=f"{calibration.measurement_id}.{standing.iterations}",
         )
     except PlanRefusedError as error:
         raise ProcedureFailedError("target_out_of_reach", str(error)) from error
@@ -231,17 +272,15 @@ def _probability(arguments: ApproachArguments, estimate: FiducialEstimate) -> fl
     )
 
 
-def _arrival(
-    arguments: ApproachArguments, standing: _Standing, probability: float, iterations: int
-) -> Arrival:
+def _arrival(arguments: ApproachArguments, standing: _Standing) -> Arrival:
     estimate = standing.calibration.estimate
     return Arrival(
         standing.calibration,
         float(np.linalg.norm(_error(arguments, estimate))),
         float(np.sqrt(np.trace(estimate.covariance_mm2) / 2)),
-        probability,
-        iterations,
+        _probability(arguments, estimate),
+        standing.iterations,
         standing.frames,
         standing.scan_s,
-        standing.measured.measurement_id,
+        standing.calibration.measurement_id,
     )

@@ -81,24 +81,30 @@ def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
     before: FiducialEstimate | None = None
     plane: ImagePlane | None = None
     for number, setpoints_um in enumerate(places):
+        if number == len(places) - 1:
+            _check(jacobian)
         moved = yield from move(MoveTo(setpoints_um, f"calibration {number + 1}/{len(places)}"))
         expectation = _expectation(before, moved.readback_um, jacobian, arguments, number)
-        _, measured = yield from measure_here(setpoints_um, "ml", expectation)
+        _, measured = yield from measure_here("ml", expectation)
         plane = _checked_plane(plane, measured)
         here = estimate_from(measured, moved.readback_um)
         if before is not None:
             if number == len(places) - 1:
                 predicted = before.moved_to(moved.readback_um, jacobian, noise)
-                check_prediction(predicted, measured, _ASYMMETRY_CHECK_SIGMA, noise)
+                check_prediction(predicted, here, _ASYMMETRY_CHECK_SIGMA, noise)
             jacobian = learn_from_move(jacobian, before, here, noise)
         before = here
     assert before is not None
     assert plane is not None
+    _check(jacobian)
+    return (yield from _refine(before, jacobian, plane, measured, arguments))
+
+
+def _check(jacobian: ImageJacobian) -> None:
     try:
         jacobian.check()
     except CalibrationError as error:
         raise ProcedureFailedError("calibration", str(error)) from error
-    return (yield from _refine(before, jacobian, plane, measured, arguments))
 
 
 def learn_from_move(
@@ -161,10 +167,9 @@ def _refine(
     measurement_id = last.measurement_id
     if len(arguments.shifts_px) > 1:
         expectation = Expectation.of(estimate, arguments.position_gate_mm, arguments.gate_sigma)
-        measured = yield from measure_shift_set(
-            estimate, arguments.shifts_px, jacobian, plane, "ml", expectation
+        found = yield from measure_shift_set(
+            estimate, arguments.shifts_px, jacobian, plane, "ml", expectation, arguments.noise
         )
-        measurement_id = measured.measurement_id
-        again = estimate_from(measured, estimate.setpoints_um)
-        estimate = estimate.fused_with(again.plane_mm, again.covariance_mm2)
+        # all that was known before has been through the same moves: nothing to add
+        estimate, measurement_id = found.estimate, found.measured.measurement_id
     return Calibration(jacobian, estimate, plane, measurement_id)

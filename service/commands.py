@@ -179,6 +179,8 @@ class Commands:
             gate_sigma=service.prediction_gate_sigma,
             repeatability_mm=service.repeatability_um / 1000,
             scale_error=service.step_scale_error,
+            strategy=service.strategy,
+            seed=self._seed(),
         )
         return self._begin(APPROACH, approach_arguments(arguments, start), by)
 
@@ -290,9 +292,13 @@ class Commands:
         name = self._config.service.shift_set
         if name != "paper":
             return named(name).shifts_px
+        return paper_random(np.random.default_rng(self._seed())).shifts_px
+
+    def _seed(self) -> int:
+        """Of the next procedure's random choices: from the case's seed and its number."""
         case = self._record.case()
-        seed = (case.seed if case else 0, len(self._record.procedures()))
-        return paper_random(np.random.default_rng(seed)).shifts_px
+        words = (case.seed if case else 0, len(self._record.procedures()))
+        return int(np.random.SeedSequence(words).generate_state(1)[0])
 
     def _travel(self) -> dict[str, Travel]:
         return {axis: Travel(low, high) for axis, (low, high) in self._link.travel_um.items()}

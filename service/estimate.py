@@ -50,12 +50,10 @@ class FiducialEstimate:
             axis: (setpoints_um[axis] - self.setpoints_um[axis]) / 1000.0 for axis in jacobian.axes
         }
         displacement, covariance = jacobian.displacement(change_mm)
-        columns = (jacobian.columns[:, (0, 2)] + jacobian.columns[:, (1, 3)]) / 2
-        scatter = np.diag([noise.variance_mm2(change_mm[axis]) for axis in jacobian.axes])
         return FiducialEstimate(
             dict(setpoints_um),
             self.plane_mm + displacement,
-            self.covariance_mm2 + covariance + columns @ scatter @ columns.T,
+            self.covariance_mm2 + covariance + motion_covariance(change_mm, jacobian, noise),
         )
 
     def fused_with(self, plane_mm: Array, covariance_mm2: Array) -> FiducialEstimate:
@@ -87,11 +85,20 @@ class FiducialEstimate:
         )
 
 
+def motion_covariance(
+    change_mm: Mapping[str, float], jacobian: ImageJacobian, noise: MotionNoise
+) -> Array:
+    """Covariance (2, 2) mm² in the image plane of what one move does beside what it should."""
+    columns = (jacobian.columns[:, (0, 2)] + jacobian.columns[:, (1, 3)]) / 2
+    scatter = np.diag([noise.variance_mm2(change_mm[axis]) for axis in jacobian.axes])
+    return np.asarray(columns @ scatter @ columns.T)
+
+
 def probability_within(offset_mm: Array, covariance_mm2: Array, tolerance_mm: float) -> float:
     """Return P(|x| < tolerance) for a normal x (2,) with this mean and covariance.
 
-    Exact up to quadrature: in the principal axes one coordinate is integrated by Gauss–Legendre,
-    the other in closed form.
+    Exact up to quadrature: in the principal axes one coordinate is integrated by Gauss–Legendre
+    (over the angle, where the chord is smooth), the other in closed form.
     """
     variances, axes = np.linalg.eigh(covariance_mm2)
     sigma = np.sqrt(np.maximum(variances, 1e-18))
@@ -101,9 +108,11 @@ def probability_within(offset_mm: Array, covariance_mm2: Array, tolerance_mm: fl
     high = min(tolerance_mm, mean[0] + _REACH_SIGMA * sigma[0])
     if not low < high:
         return 0.0
-    x = (high + low) / 2 + (high - low) / 2 * _NODES
-    density = np.exp(-0.5 * ((x - mean[0]) / sigma[0]) ** 2) / (sigma[0] * np.sqrt(2 * np.pi))
-    half_chord = np.sqrt(np.maximum(tolerance_mm**2 - x**2, 0.0))
+    first, last = np.arcsin(low / tolerance_mm), np.arcsin(high / tolerance_mm)
+    angle = (last + first) / 2 + (last - first) / 2 * _NODES
+    half_chord = tolerance_mm * np.cos(angle)
+    standard = (tolerance_mm * np.sin(angle) - mean[0]) / sigma[0]
+    density = np.exp(-0.5 * standard**2) / (sigma[0] * np.sqrt(2 * np.pi))
     inside = ndtr((half_chord - mean[1]) / sigma[1]) - ndtr((-half_chord - mean[1]) / sigma[1])
-    total = (high - low) / 2 * float(np.sum(_WEIGHTS * density * inside))
+    total = (last - first) / 2 * float(np.sum(_WEIGHTS * density * half_chord * inside))
     return min(1.0, max(0.0, total))

@@ -7,14 +7,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-import numpy as np
-
 from case_record.record import CaseRecord
 from case_record.rows import Hold
 from robot_bridge.client import LinkLostError, MoveOutcome, RefusedError
 from robot_bridge.messages import CommandState
 from robot_bridge.phases import WorkPhase, motion_allowed
 from room_config.load import Config
+from service.measuring import measure_request, measured_from_result
 from service.room_link import RoomLink
 from service.steps import (
     Acquire,
@@ -192,7 +191,7 @@ class Execution:
     # Slices and measurements
 
     def _acquire(self, step: Acquire) -> Acquired:
-        hold = self._hold_to_image()
+        hold = self._hold_to_image(fresh=step.fresh)
         self._record.expect_slices(hold.hold_id, step.count)
         self._let_clocks_agree(hold)
         attempt = 0
@@ -229,13 +228,14 @@ class Execution:
                 return
             self._wait()
 
-    def _hold_to_image(self) -> Hold:
-        """The open hold; a new one where the robot stands, if it was ended by a restart."""
+    def _hold_to_image(self, *, fresh: bool) -> Hold:
+        """The open hold; a new one where the robot stands if asked for, or after a restart."""
         while True:
             hold = self._record.open_hold()
             status = self._link.status
             if status is not None and not status.moving and status.position_certain:
-                if hold is not None and hold.readback_um == dict(status.positions_um):
+                stands = hold is not None and hold.readback_um == dict(status.positions_um)
+                if hold is not None and stands and not fresh:
                     return hold
                 with self._record.transaction():
                     self._record.end_open_hold(time.time())
@@ -245,32 +245,16 @@ class Execution:
 
     def _measure(self, step: Measure) -> Measured:
         imaging = self._config.imaging
-        request = {
-            "holds": [{"hold_id": h.hold_id, "shift_mm": list(h.shift_mm)} for h in step.holds],
-            "expected_plane_mm": None
-            if step.expected_plane_mm is None
-            else list(step.expected_plane_mm),
-            "gate_mm": step.gate_mm,
-            "radius_mm": [imaging.fiducial_radius_min_mm, imaging.fiducial_radius_max_mm],
-        }
+        radius_mm = (imaging.fiducial_radius_min_mm, imaging.fiducial_radius_max_mm)
         hold_ids = [h.hold_id for h in step.holds]
+        request = measure_request(step, radius_mm)
         number = self._record.request_measurement(step.method, hold_ids, request)
         self.prompt = "Localizing the fiducial."
         while (measurement := self._record.measurement(number)).state == "requested":
             self._wait()
         if measurement.state == "failed" or measurement.result is None:
             return Measured(number, measurement.reason_code or "failed", measurement.reason)
-        result = measurement.result
-        row, col = result["plane_mm"]
-        (a, b), (c, d) = np.array(result["covariance_mm2"]).tolist()
-        return Measured(
-            number,
-            plane_mm=(row, col),
-            covariance_mm2=((a, b), (c, d)),
-            plane=result["plane"],
-            frames=result["n_frames"],
-            scan_s=result["scan_s"],
-        )
+        return measured_from_result(number, measurement.result)
 
     # The operator
 

@@ -32,6 +32,7 @@ def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> Non
 
     configure_logs()
     room = load_config(config)
+    check_device(room.service.bridge_link)
     listening = bind(room)
     host, port = listening.getsockname()[:2]
     url = f"http://{host}:{port}"
@@ -72,6 +73,12 @@ def bind(room: Config) -> socket.socket:
         listening.close()
         raise ConfigError(f"service port {host}:{port}: {error.strerror}") from None
     return listening
+
+
+def check_device(link: str) -> None:
+    """ConfigError if the line to the bridge is a device that does not exist."""
+    if "://" not in link and not Path(link).exists():
+        raise ConfigError(f"key service.bridge_link: there is no device {link}")
 
 
 def announce(facts: dict[str, object]) -> None:

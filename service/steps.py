@@ -31,9 +31,13 @@ class MoveTo:
 
 @dataclass(frozen=True)
 class Acquire:
-    """Wait until `count` slices in all were acquired at the present hold."""
+    """Wait until `count` slices in all were acquired at the present hold.
+
+    fresh: begin a new hold here first, without any motion, so that earlier slices do not count.
+    """
 
     count: int
+    fresh: bool = False
 
 
 @dataclass(frozen=True)
@@ -49,12 +53,14 @@ class Measure:
     """Localize the fiducial from all slices of the given holds.
 
     expected_plane_mm and gate_mm: where it must be (image plane), None when nothing is known.
+    shift_sigma_mm: how far a hold may be from its shift, per axis (standard deviation).
     """
 
     holds: tuple[HoldShift, ...]
     method: str
     expected_plane_mm: tuple[float, float] | None = None
     gate_mm: float | None = None
+    shift_sigma_mm: float = 0.0
 
 
 @dataclass(frozen=True)

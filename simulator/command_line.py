@@ -17,7 +17,10 @@ from simulator.scanner import operate
 
 BAD_INPUT = 2
 
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
+
+@app.command()
 def scanner(
     config: Annotated[Path, typer.Option(help="The room's TOML file; its [virtual] table.")],
     exit_with_parent: Annotated[
@@ -32,9 +35,8 @@ def scanner(
         room = _virtual_room(config)
         assert room.scanner is not None
         stop = _stop_event(exit_with_parent)
-        ready = {"ready": "scanner", "truth_file": str(Path(room.scanner.truth_file).resolve())}
-        print(json.dumps(ready), flush=True)
-        operate(room, stop, _note)
+        ready = {"ready": "scanner", "truth_file": room.scanner.truth_file}
+        operate(room, stop, _note, lambda: print(json.dumps(ready), flush=True))
     except (ConfigError, VirtualRoomError) as error:
         print(error, file=sys.stderr)
         raise typer.Exit(BAD_INPUT) from None
@@ -47,7 +49,10 @@ def _virtual_room(path: Path) -> VirtualRoom:
         raise VirtualRoomError(f"{path}: {error}") from None
     if room.scanner is None:
         raise VirtualRoomError(f"{path}: virtual.scanner: missing table")
-    return room
+    # Relative to the configuration, as every path in it.
+    truth_file = str((path.parent / room.scanner.truth_file).resolve())
+    scanner = room.scanner.model_copy(update={"truth_file": truth_file})
+    return room.model_copy(update={"scanner": scanner})
 
 
 def _stop_event(exit_with_parent: bool) -> threading.Event:
@@ -72,10 +77,5 @@ def _note(line: str) -> None:
     print(json.dumps({"process": "scanner", "note": line}), file=sys.stderr, flush=True)
 
 
-def main() -> None:
-    """`python -m simulator.command_line --config FILE`."""
-    typer.run(scanner)
-
-
 if __name__ == "__main__":
-    main()
+    app()

@@ -124,7 +124,7 @@ class SliceProtocol(_Table):
     window: Literal["flat", "hamming", "fermi", "elliptical"] = "flat"
     """The filter in k-space."""
     snr: Positive = 30.0
-    """Signal 1 over the noise of one channel (real or imaginary) in the image."""
+    """Signal 1 over the noise of one channel (real or imaginary) before the filter."""
     shading_per_mm: tuple[float, float] = (0.0006, -0.0009)
     """Relative slope of the receive sensitivity along rows and columns, from the middle."""
     shading_per_mm2: float = -6.0e-6

@@ -37,6 +37,12 @@ class DemoOptions:
     speed_factor: float = 3.0
 
 
+class PortInUseError(Exception):
+    """A port that the user asked for cannot be had."""
+
+    exit_code = 2
+
+
 class DemoRoom:
     """Start it, talk to it at `url`, end it. Everything it writes lies in the case folder."""
 
@@ -121,7 +127,7 @@ class DemoRoom:
                 try:
                     probe.bind(("127.0.0.1", port))
                 except OSError as error:
-                    raise ChildError(f"port {port}: {error.strerror}") from None
+                    raise PortInUseError(f"port {port}: {error.strerror}") from None
             first, second = (int(probe.getsockname()[1]) for probe in probes)
         finally:
             for probe in probes:
@@ -150,6 +156,8 @@ class DemoRoom:
                 # as if the clocks had been compared at the console, to a fiftieth of a second
                 "clock_offset_s": -_CLOCK_OFFSET_S,
                 "clock_uncertainty_s": 0.02,
+                # the virtual scanner reconstructs in 0.15 s and sends at once
+                "prompt_delay_s": 0.3,
             },
             "service": {
                 "port": page_port,

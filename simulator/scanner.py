@@ -21,6 +21,7 @@ from pydicom.dataset import Dataset
 
 from simulator.config import ScannerSettings, VirtualRoom, VirtualRoomError
 from simulator.dicom_writer import AcquisitionStamp, Series, Study, write_mr_image
+from simulator.enhanced_writer import write_enhanced_mr_image
 from simulator.faults import corrupt, distorted, jumped_clock_s, phase_of, strike
 from simulator.mr_slice import AcquiredSlice, StagePath, acquire
 from simulator.outbox import Delivery, Outbox
@@ -28,7 +29,7 @@ from simulator.truth_client import TruthAddress, TruthError, ask_path, ask_where
 
 Note = Callable[[str], None]
 
-_HELD_BACK_AT_MOST_S = 5.0
+_HELD_BACK_AT_MOST_S = 2.5
 _DUPLICATE_AFTER_S = 0.1
 
 
@@ -230,7 +231,9 @@ class VirtualScanner:
             instance_number=scan.index + 1,
             reconstructed_s=self.clock_s(scan.ended_s) + self._settings.reconstruction_s,
         )
-        return write_mr_image(
+        enhanced = self._settings.sop_class == "enhanced"
+        write = write_enhanced_mr_image if enhanced else write_mr_image
+        return write(
             pixels,
             scan.slice.geometry,
             protocol=(room or self._room).protocol,
@@ -294,8 +297,13 @@ def read_request(http: httpx.Client, service_url: str) -> AcquisitionRequest | N
         raise ValueError(f"acquisition_request.{key}: {first['msg']}") from None
 
 
-def operate(room: VirtualRoom, stop: threading.Event, note: Note) -> None:
-    """Play the scanner and its operator until `stop` is set.
+def operate(
+    room: VirtualRoom,
+    stop: threading.Event,
+    note: Note,
+    ready: Callable[[], None] = lambda: None,
+) -> None:
+    """Play the scanner and its operator until `stop` is set; `ready` is called once it begins.
 
     Raises VirtualRoomError if the room has no scanner or the truth file cannot be written.
     """
@@ -313,6 +321,7 @@ def operate(room: VirtualRoom, stop: threading.Event, note: Note) -> None:
     served: set[str] = set()
     with httpx.Client(timeout=2.0, trust_env=False) as http, Outbox(settings, report) as outbox:
         scanner = VirtualScanner(room, truth, outbox, say)
+        ready()
         while not stop.wait(settings.poll_s):
             try:
                 request = read_request(http, settings.service_url)

@@ -1,67 +1,52 @@
 """Maximum-likelihood fit of one round object in one frame, with its covariance.
 
-Model of the noise-free signal, x = pixel - reference pixel:
-
-    m = (A s(pixel - c; R, psf) + B) (1 + b . x) + a . x
-
-c centre, R radius, A amplitude, B background, b relative shading, a slope of the surroundings.
-The pixels have the Rician mean and variance that belong to m (or Gaussian ones, from a camera).
-Noise that passed a k-space filter is coloured and is whitened with the correlation that the filter
-gives it. Solved by Levenberg-Marquardt with analytic derivatives.
-
-Priors, all of mean zero. Unknown shading costs 10 to 25 % of precision, no shading allowed for
-costs 0.45 b R in bias; the prior is what is known of coils:
-  b   a mixture: typical shading of 0.5 % a pixel, or (one frame in two) strong, of 3 % a pixel
-  a   likewise 0.1 %, or 2 %, of |A| + |B| a pixel
+The pixels have the Rician mean and variance that belong to the signal of `signal` (or Gaussian
+ones, from a camera). Noise that passed a k-space filter is coloured and is whitened with the
+correlation that the filter gives it. Levenberg-Marquardt with analytic derivatives, in rounds: each
+takes the weights, the noise level and the mask of odd pixels from the fit before it.
 """
 
-from dataclasses import dataclass
-from functools import lru_cache
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.linalg import cho_factor, cho_solve, cholesky, solve_triangular
+from scipy.linalg import solve_triangular
 
 from sr_engine.errors import NotConvergedError
-from sr_engine.model import DISC, Patch, Shape, unit_object
-from sr_engine.noise import NoiseKind, correlation, is_white, moments, sigma_of
+from sr_engine.model import DISC, Shape, unit_object
+from sr_engine.noise import NoiseKind, colour_factor, is_white, moments, sigma_of
 from sr_engine.psf import Psf
+from sr_engine.signal import (
+    AMPLITUDE,
+    BACKGROUND,
+    N_PARAMETERS,
+    RADIUS,
+    SURROUNDINGS,
+    Mask,
+    ObjectModel,
+    Pixels,
+    prior_precision,
+    signal_of,
+)
 
 Array = NDArray[np.float64]
-Mask = NDArray[np.bool_]
 
-ROW, COL, RADIUS, AMPLITUDE, BACKGROUND = range(5)
-SLOPES, SHADING = slice(5, 7), slice(7, 9)
-N_PARAMETERS = 9
-
-SHADING_SCALES = 0.005, 0.03  # std of the typical and of the strong, relative, per pixel
-SLOPE_SCALES = 0.001, 0.02
-_BACKGROUND_SCALE = 10.0
 _OUTLIER_SIGMA = 4.5
 _OUTLIER_NEIGHBOUR_SIGMA = 2.5
 _MAX_ITERATIONS = 60
 _MAX_ROUNDS = 8
-_SETTLED = 1e-5  # last change of chi2, so of 0.003 sigma in any parameter
-_WHITE_FLOOR = 0.02  # share of noise power taken as white, so that what was never sampled is finite
-
-
-@dataclass(frozen=True, eq=False)
-class Pixels:
-    """The pixels of a region of interest: values (rows, cols), and which of them count."""
-
-    patch: Patch
-    values: Array
-    mask: Mask
+_SAME_SIGMA = 0.1  # relative change of the noise level that leaves the weights as they are
+_SETTLED = 1e-4  # expected change of chi2, so a step of 0.01 sigma in any parameter
 
 
 @dataclass(frozen=True, eq=False)
 class DiscFit:
-    """The fit of one frame. `parameters` in the order of this module's constants."""
+    """The fit of one frame. `parameters` in the order of `signal`'s constants."""
 
     parameters: Array
     covariance: Array  # of all parameters; what noise and prior leave uncertain
     sigma: float  # noise std per channel, from the residuals unless it was given
-    chi2_per_dof: float  # against the given noise, or against the frame's own (see `noise_level`)
+    chi2_per_dof: float
     n_pixels: int
     n_masked: int
     explained: float  # chi2 that the object takes away, against background and slopes alone
@@ -83,72 +68,49 @@ class DiscFit:
         return float(self.parameters[AMPLITUDE])
 
     @property
+    def background(self) -> float:
+        return float(self.parameters[BACKGROUND])
+
+    @property
     def snr(self) -> float:
         return abs(self.amplitude) / self.sigma
 
-
-def signal_of(
-    parameters: Array, patch: Patch, psf: Psf, shape: Shape, reference_px: tuple[float, float]
-) -> tuple[Array, Array]:
-    """Noise-free signal (n,) on the patch, row-major, and its derivatives (n, 9)."""
-    row, col, radius, amplitude, background = parameters[:5]
-    s, s_row, s_col, s_radius = unit_object(patch, psf, shape, (row, col), radius)
-    x_row = (patch.rows - reference_px[0])[:, None] + np.zeros_like(s)
-    x_col = (patch.cols - reference_px[1])[None, :] + np.zeros_like(s)
-    (a_row, a_col), (b_row, b_col) = parameters[SLOPES], parameters[SHADING]
-    shading = 1 + b_row * x_row + b_col * x_col
-    unshaded = amplitude * s + background
-    signal = unshaded * shading + a_row * x_row + a_col * x_col
-    lit = amplitude * shading
-    derivatives = (
-        lit * s_row,
-        lit * s_col,
-        lit * s_radius,
-        s * shading,
-        shading,
-        x_row,
-        x_col,
-        unshaded * x_row,
-        unshaded * x_col,
-    )
-    return signal.ravel(), np.stack([d.ravel() for d in derivatives], axis=1)
-
-
-def prior_precision(parameters: Array) -> Array:
-    """(9,) inverse variances of the priors, at the present estimate of the shading.
-
-    A mixture acts as a Gaussian whose precision is the expectation over its two components (an EM
-    step), so that strong shading is not held back.
-    """
-    level = abs(parameters[AMPLITUDE]) + abs(parameters[BACKGROUND])
-    precision = np.zeros(N_PARAMETERS)
-    precision[BACKGROUND] = 1 / (_BACKGROUND_SCALE * level) ** 2
-    precision[SLOPES] = _mixture_precision(parameters[SLOPES] / level, SLOPE_SCALES) / level**2
-    precision[SHADING] = _mixture_precision(parameters[SHADING], SHADING_SCALES)
-    return precision
-
-
-def _mixture_precision(pair: Array, scales: tuple[float, float]) -> float:
-    narrow, wide = 1 / scales[0] ** 2, 1 / scales[1] ** 2
-    log_odds = np.log(wide / narrow) + 0.5 * float(pair @ pair) * (narrow - wide)
-    share = 1 / (1 + np.exp(min(log_odds, 700.0)))
-    return float(share * narrow + (1 - share) * wide)
+    def moved_to(self, centre_px: Array) -> "DiscFit":
+        """The same object elsewhere: where to start in the next frame."""
+        return replace(self, parameters=np.concatenate([centre_px, self.parameters[2:]]))
 
 
 @dataclass(frozen=True, eq=False)
 class _Problem:
     pixels: Pixels
-    psf: Psf
-    shape: Shape
+    model: ObjectModel
     noise: NoiseKind
-    reference_px: tuple[float, float]
     radius_bounds_px: tuple[float, float]
-    colour: Array | None  # lower Cholesky factor of the noise correlation of the masked pixels
+
+
+@dataclass(frozen=True, eq=False)
+class _Metric:
+    """How residuals are weighed during one round: fixed, so that chi2 is one function."""
+
+    sigma: float
+    weights: Array  # (n,) one over the std of each pixel
+    colour: Array | None  # lower Cholesky factor of the correlation of the pixels' noise
+
+
+@dataclass(frozen=True, eq=False)
+class _Linearised:
+    """chi2 around one set of parameters."""
+
+    signal: Array  # (rows, cols)
+    residual: Array  # (n,) whitened
+    jacobian: Array  # (n, 9) whitened
+    information: Array  # (9, 9)
+    bend: Array  # (9, 9) what the curvature of the Rician mean adds to the information
 
 
 def fit_disc(
     pixels: Pixels,
-    start: tuple[float, float, float],
+    start: tuple[float, float, float] | DiscFit,
     psf: Psf,
     *,
     radius_bounds_px: tuple[float, float],
@@ -157,181 +119,130 @@ def fit_disc(
     sigma: float | None = None,
     robust: bool = True,
 ) -> DiscFit:
-    """Fit the object that starts at (row, col, radius).
+    """Fit the object that starts at (row, col, radius), or like another fit.
 
     sigma: noise std per channel where it is known; otherwise it is taken from the residuals.
     robust: leave out pixels that disagree with any round object (a bubble, a neighbour).
     Raises NotConvergedError when the fit does not settle or leaves radius_bounds_px.
     """
-    reference = (float(np.round(start[0])), float(np.round(start[1])))
-    mask = pixels.mask.copy()
-    problem = _problem(pixels, mask, psf, shape, noise, reference, radius_bounds_px)
-    parameters = _linear_start(problem, start)
-    level = sigma if sigma is not None else _first_sigma(problem, parameters)
+    begin = start.parameters[:2] if isinstance(start, DiscFit) else np.array(start[:2])
+    reference = (float(np.round(begin[0])), float(np.round(begin[1])))
+    problem = _Problem(pixels, ObjectModel(psf, shape, reference), noise, radius_bounds_px)
+    if isinstance(start, DiscFit):
+        parameters, level = start.parameters.copy(), start.sigma
+    else:
+        parameters, level = _linear_start(problem, start)
+    level = level if sigma is None else sigma
+    signal, _ = signal_of(parameters, pixels.patch, problem.model)
     for _ in range(_MAX_ROUNDS):
-        parameters = _levenberg_marquardt(problem, parameters, level)
-        residual = _standardised(problem, parameters, level)
-        new_mask = _without_outliers(pixels, residual, sigma is not None) if robust else mask
-        new_level = (
-            sigma if sigma is not None else _next_sigma(problem, parameters, level, new_mask)
-        )
-        settled = np.array_equal(new_mask, mask) and abs(new_level / level - 1) < 0.02
-        mask, level = new_mask, new_level
-        if settled:
+        metric = _metric(problem, signal, level)
+        parameters, at = _levenberg_marquardt(problem, parameters, metric)
+        mask = _without_outliers(problem, pixels.mask, at, metric, sigma) if robust else pixels.mask
+        old = level
+        if sigma is None:
+            level = _next_sigma(problem, mask, at, level, float(abs(parameters[AMPLITUDE])))
+        same = np.array_equal(mask, problem.pixels.mask) and abs(level / old - 1) < _SAME_SIGMA
+        if same:
             break
-        problem = _problem(pixels, mask, psf, shape, noise, reference, radius_bounds_px)
-    return _summary(problem, parameters, level)
+        problem, signal = replace(problem, pixels=replace(pixels, mask=mask)), at.signal
+    return _summary(problem, parameters, at, level, metric.sigma / level)
 
 
-def _problem(
-    pixels: Pixels,
-    mask: Mask,
-    psf: Psf,
-    shape: Shape,
-    noise: NoiseKind,
-    reference_px: tuple[float, float],
-    bounds: tuple[float, float],
-) -> _Problem:
-    colour = None
-    if not is_white(psf):
-        colour = _colour(pixels.patch.period, psf, mask.shape, np.packbits(mask).tobytes())
-    chosen = Pixels(pixels.patch, pixels.values, mask)
-    return _Problem(chosen, psf, shape, noise, reference_px, bounds, colour)
-
-
-@lru_cache(maxsize=32)
-def _colour(period: tuple[int, int], psf: Psf, shape: tuple[int, int], packed_mask: bytes) -> Array:
-    """Lower Cholesky factor of the noise correlation between the pixels of a mask."""
-    bits = np.unpackbits(np.frombuffer(packed_mask, np.uint8), count=shape[0] * shape[1])
-    row, col = np.nonzero(bits.reshape(shape))
-    table = correlation(period, psf, max(shape))
-    matrix = table[np.abs(row[:, None] - row), np.abs(col[:, None] - col)] * (1 - _WHITE_FLOOR)
-    matrix[np.diag_indices_from(matrix)] += _WHITE_FLOOR
-    return np.asarray(cholesky(matrix, lower=True))
-
-
-def _linear_start(problem: _Problem, start: tuple[float, float, float]) -> Array:
-    """All parameters, amplitude and background by least squares at the given centre and radius."""
+def _linear_start(problem: _Problem, start: tuple[float, float, float]) -> tuple[Array, float]:
+    """Parameters with amplitude and background by least squares, and a noise level to begin at."""
     parameters = np.zeros(N_PARAMETERS)
-    low, high = problem.radius_bounds_px
-    parameters[:3] = start[0], start[1], np.clip(start[2], low, high)
-    parameters[AMPLITUDE] = 1.0
-    patch = problem.pixels.patch
-    s, _, _, _ = unit_object(
-        patch, problem.psf, problem.shape, (start[0], start[1]), parameters[RADIUS]
-    )
-    inside = problem.pixels.mask
-    basis = np.stack([s[inside], np.ones(int(inside.sum()))], axis=1)
-    solution, *_ = np.linalg.lstsq(basis, problem.pixels.values[inside], rcond=None)
-    parameters[[AMPLITUDE, BACKGROUND]] = solution
-    if parameters[AMPLITUDE] == 0:
+    parameters[:2] = start[:2]
+    parameters[RADIUS] = np.clip(start[2], *problem.radius_bounds_px)
+    model, mask = problem.model, problem.pixels.mask
+    centre, radius = (start[0], start[1]), float(parameters[RADIUS])
+    s, *_ = unit_object(problem.pixels.patch, model.psf, model.shape, centre, radius)
+    basis = np.stack([s[mask], np.ones(int(mask.sum()))], axis=1)
+    values = problem.pixels.values[mask]
+    solution, *_ = np.linalg.lstsq(basis, values, rcond=None)
+    if solution[0] == 0:
         raise NotConvergedError("no contrast at the start position")
-    return parameters
+    parameters[[AMPLITUDE, BACKGROUND]] = solution
+    misfit = float(1.4826 * np.median(np.abs(values - np.abs(basis @ solution))))
+    return parameters, max(misfit, 1e-9 * float(np.ptp(values)))
 
 
-def _first_sigma(problem: _Problem, parameters: Array) -> float:
-    signal, _ = signal_of(
-        parameters, problem.pixels.patch, problem.psf, problem.shape, problem.reference_px
-    )
-    inside = problem.pixels.mask.ravel()
-    residual = (problem.pixels.values.ravel() - np.abs(signal))[inside]
-    floor = 1e-9 * float(np.ptp(problem.pixels.values[problem.pixels.mask]))
-    return max(float(1.4826 * np.median(np.abs(residual))), floor)
+def _next_sigma(
+    problem: _Problem, mask: Mask, at: _Linearised, sigma: float, amplitude: float
+) -> float:
+    values = problem.pixels.values[mask]
+    new = sigma_of(values, at.signal[mask], sigma, problem.noise, N_PARAMETERS)
+    return max(new, 1e-9 * amplitude)
 
 
-def _standardised(problem: _Problem, parameters: Array, sigma: float) -> Array:
-    """(n,) residuals of all pixels of the patch, each over its own std."""
-    signal, _ = signal_of(
-        parameters, problem.pixels.patch, problem.psf, problem.shape, problem.reference_px
-    )
-    expected = moments(signal, sigma, problem.noise)
-    return np.asarray((problem.pixels.values.ravel() - expected.mean) / np.sqrt(expected.variance))
-
-
-def _next_sigma(problem: _Problem, parameters: Array, sigma: float, mask: Mask) -> float:
-    patch, values = problem.pixels.patch, problem.pixels.values
-    signal, _ = signal_of(parameters, patch, problem.psf, problem.shape, problem.reference_px)
-    inside = mask.ravel()
-    new = sigma_of(values.ravel()[inside], signal[inside], sigma, problem.noise, N_PARAMETERS)
-    return max(new, 1e-9 * abs(float(parameters[AMPLITUDE])))
-
-
-def _without_outliers(pixels: Pixels, residual: Array, known_noise: bool) -> Mask:
+def _without_outliers(
+    problem: _Problem, mask: Mask, at: _Linearised, metric: _Metric, known_sigma: float | None
+) -> Mask:
     """The mask without pixels that no round object explains, and without their odd neighbours."""
-    size = np.abs(residual).reshape(pixels.mask.shape)
-    spread = 1.4826 * float(np.median(size[pixels.mask]))
-    spread = max(spread, 1.0) if known_noise else max(spread, 1e-12)
-    out = pixels.mask & (size > _OUTLIER_SIGMA * spread)
+    expected = moments(at.signal, metric.sigma, problem.noise)
+    size = np.abs(problem.pixels.values - expected.mean) / np.sqrt(expected.variance)
+    spread = 1.4826 * float(np.median(size[mask]))
+    spread = max(spread, 1.0) if known_sigma is not None else max(spread, 1e-12)
+    out = mask & (size > _OUTLIER_SIGMA * spread)
     if not out.any():
-        return pixels.mask
-    near = np.zeros_like(out)
+        return mask
     padded = np.pad(out, 1)
     rows, cols = out.shape
+    near = np.zeros_like(out)
     for i in range(3):
         for j in range(3):
             near |= padded[i : i + rows, j : j + cols]
-    keep = pixels.mask & ~out & ~(near & (size > _OUTLIER_NEIGHBOUR_SIGMA * spread))
-    return keep if keep.sum() > 0.5 * pixels.mask.sum() else pixels.mask
+    keep = mask & ~out & ~(near & (size > _OUTLIER_NEIGHBOUR_SIGMA * spread))
+    return keep if keep.sum() > 0.5 * mask.sum() else mask
 
 
-@dataclass(frozen=True, eq=False)
-class _Linearised:
-    """chi2 around one set of parameters, with the pixel weights that it was taken with."""
-
-    weights: Array
-    residual: Array  # (n,) whitened
-    jacobian: Array  # (n, 9) whitened
-    bend: Array  # (9, 9) what the curvature of the Rician mean adds to half the Hessian
-
-    @property
-    def information(self) -> Array:
-        return np.asarray(self.jacobian.T @ self.jacobian)
+def _metric(problem: _Problem, signal: Array, sigma: float) -> _Metric:
+    mask, psf = problem.pixels.mask, problem.model.psf
+    expected = moments(signal[mask], sigma, problem.noise)
+    colour = None
+    if not is_white(psf):
+        colour = colour_factor(problem.pixels.patch.period, psf, mask, expected, sigma)
+    return _Metric(sigma, 1 / np.sqrt(expected.variance), colour)
 
 
-def _linearise(
-    problem: _Problem, parameters: Array, sigma: float, weights: Array | None = None
-) -> _Linearised:
-    signal, derivatives = signal_of(
-        parameters, problem.pixels.patch, problem.psf, problem.shape, problem.reference_px
-    )
-    inside = problem.pixels.mask.ravel()
-    derivatives = derivatives[inside]
-    expected = moments(signal[inside], sigma, problem.noise)
-    weights = 1 / np.sqrt(expected.variance) if weights is None else weights
-    residual = (problem.pixels.values.ravel()[inside] - expected.mean) * weights
-    jacobian = derivatives * (expected.slope * weights)[:, None]
+def _linearise(problem: _Problem, parameters: Array, metric: _Metric) -> _Linearised:
+    signal, derivatives = signal_of(parameters, problem.pixels.patch, problem.model)
+    mask = problem.pixels.mask
+    by_parameter = derivatives[:, mask]
+    expected = moments(signal[mask], metric.sigma, problem.noise)
+    residual = (problem.pixels.values[mask] - expected.mean) * metric.weights
+    jacobian = (by_parameter * (expected.slope * metric.weights)).T
     force = residual
-    if problem.colour is not None:
+    if metric.colour is not None:
         both = np.column_stack([residual, jacobian])
-        both = solve_triangular(problem.colour, both, lower=True, check_finite=False)
+        both = solve_triangular(metric.colour, both, lower=True, check_finite=False)
         residual, jacobian = both[:, 0], both[:, 1:]
-        force = solve_triangular(
-            problem.colour, residual, lower=True, trans="T", check_finite=False
-        )
-    bend = -(derivatives.T * (force * weights * expected.curvature)) @ derivatives
-    return _Linearised(weights, residual, jacobian, bend)
+        force = solve_triangular(metric.colour, residual, lower=True, trans="T", check_finite=False)
+    bend = -(by_parameter * (force * metric.weights * expected.curvature)) @ by_parameter.T
+    return _Linearised(signal, residual, jacobian, jacobian.T @ jacobian, bend)
 
 
-def _levenberg_marquardt(problem: _Problem, parameters: Array, sigma: float) -> Array:
-    """Minimise chi2 + prior with the weights of the start: new weights are the caller's round."""
+def _levenberg_marquardt(
+    problem: _Problem, parameters: Array, metric: _Metric
+) -> tuple[Array, _Linearised]:
+    """Minimise chi2 + prior in one metric."""
     damping: float = 1e-3
-    at = _linearise(problem, parameters, sigma)
+    at = _linearise(problem, parameters, metric)
     precision = prior_precision(parameters)
     low, high = problem.radius_bounds_px
     for _ in range(_MAX_ITERATIONS):
         gradient = at.jacobian.T @ at.residual - precision * parameters
         cost = float(at.residual @ at.residual + precision @ parameters**2)
         step = _damped_step(at, precision, gradient, damping)
+        if gradient @ step < _SETTLED * max(1.0, cost / at.residual.size):
+            return parameters + step, at
         moved = parameters + step
         moved[RADIUS] = np.clip(moved[RADIUS], low, high)
-        there = _linearise(problem, moved, sigma, at.weights)
+        there = _linearise(problem, moved, metric)
         if there.residual @ there.residual + precision @ moved**2 <= cost * (1 + 1e-12):
             parameters, at = moved, there
-            damping = max(damping / 10, 1e-9)
-            if gradient @ step < _SETTLED * max(1.0, cost / at.residual.size):
-                return parameters
+            damping = max(damping / 30, 1e-9)
         elif damping > 1e8:
-            return parameters  # no direction improves: as far down as rounding allows
+            return parameters, at  # no direction improves: as far down as rounding allows
         else:
             damping *= 10
     raise NotConvergedError(f"the fit did not settle in {_MAX_ITERATIONS} iterations")
@@ -341,42 +252,57 @@ def _damped_step(at: _Linearised, precision: Array, gradient: Array, damping: fl
     """Newton's step where the Hessian is positive, the Gauss-Newton step elsewhere, damped."""
     gauss_newton = at.information + np.diag(precision)
     damper = np.diag(damping * np.diag(gauss_newton))
+    hessian = gauss_newton + at.bend + damper
     try:
-        factor = cho_factor(gauss_newton + at.bend + damper, check_finite=False)
+        np.linalg.cholesky(hessian)
     except np.linalg.LinAlgError:
-        factor = cho_factor(gauss_newton + damper, check_finite=False)
-    return np.asarray(cho_solve(factor, gradient, check_finite=False))
+        hessian = gauss_newton + damper
+    return np.asarray(np.linalg.solve(hessian, gradient))
 
 
-def _summary(problem: _Problem, parameters: Array, sigma: float) -> DiscFit:
+def _summary(
+    problem: _Problem, parameters: Array, at: _Linearised, sigma: float, scale: float
+) -> DiscFit:
+    """The fit as the last round left it; scale: that round's noise level over the final one."""
     low, high = problem.radius_bounds_px
     if not low < parameters[RADIUS] < high:
         raise NotConvergedError(
             f"the radius ran to the end of its range, {parameters[RADIUS]:.2f} px in "
             f"[{low:.2f}, {high:.2f}]"
         )
-    at = _linearise(problem, parameters, sigma)
-    residual = at.residual
-    precision = prior_precision(parameters)
-    inverse = np.linalg.inv(at.information + np.diag(precision))
-    pull = inverse @ (precision * parameters)
-    covariance = inverse @ at.information @ inverse + np.outer(pull, pull)
-    n = residual.size
+    at = replace(
+        at,
+        residual=at.residual * scale,
+        jacobian=at.jacobian * scale,
+        information=at.information * scale**2,
+    )
+    n = at.residual.size
     return DiscFit(
         parameters=parameters,
-        covariance=covariance,
+        covariance=_covariance(at, parameters),
         sigma=sigma,
-        chi2_per_dof=float(residual @ residual) / max(n - N_PARAMETERS, 1),
+        chi2_per_dof=float(at.residual @ at.residual) / max(n - N_PARAMETERS, 1),
         n_pixels=n,
-        n_masked=int(problem.pixels.mask.size - n),
-        explained=_explained(residual, at.jacobian, parameters),
+        n_masked=int(np.count_nonzero(~problem.pixels.mask)),
+        explained=_explained(at, parameters),
     )
 
 
-def _explained(residual: Array, jacobian: Array, parameters: Array) -> float:
+def _covariance(at: _Linearised, parameters: Array) -> Array:
+    """Mean squared error of the estimate: what the noise does to it, and the pull of the prior.
+
+    The pull is judged by the estimate itself, so this is right for an object without shading as
+    for one with it, which the inverse of information plus prior is not.
+    """
+    precision = prior_precision(parameters)
+    inverse = np.linalg.inv(at.information + np.diag(precision))
+    pull = inverse @ (precision * parameters)
+    return np.asarray(inverse @ at.information @ inverse + np.outer(pull, pull))
+
+
+def _explained(at: _Linearised, parameters: Array) -> float:
     """Growth of chi2 if the object were not there, background and slopes adapting (linearised)."""
-    null = [BACKGROUND, 5, 6]
-    target = residual + jacobian[:, AMPLITUDE] * parameters[AMPLITUDE]
-    solution, *_ = np.linalg.lstsq(jacobian[:, null], target, rcond=None)
-    left = target - jacobian[:, null] @ solution
-    return float(left @ left - residual @ residual)
+    target = at.residual + at.jacobian[:, AMPLITUDE] * parameters[AMPLITUDE]
+    basis, _ = np.linalg.qr(at.jacobian[:, SURROUNDINGS])
+    left = target - basis @ (basis.T @ target)
+    return float(left @ left - at.residual @ at.residual)

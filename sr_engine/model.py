@@ -149,25 +149,39 @@ def spectrum_near(
 
 @dataclass(frozen=True, eq=False)
 class Patch:
-    """A rectangle of pixels of a frame, and the period of the frame that it is from."""
+    """A rectangle of consecutive pixels of a frame, and the period of that frame."""
 
     rows: Array
     cols: Array
     period: tuple[int, int]
 
 
+@lru_cache(maxsize=32)
+def _waves(n: int, period: tuple[int, int], psf: Psf, axis: int) -> tuple[Array, Array, Array]:
+    """cos and sin of 2 pi k x at x = 0..n-1 (n, K), and 2 pi k (K,), along one axis."""
+    space = k_space(period, psf)
+    q = 2 * np.pi * (space.k_row if axis == 0 else space.k_col)
+    angle = np.outer(np.arange(n), q)
+    return np.cos(angle), np.sin(angle), q
+
+
+def _displaced_waves(
+    pixels: Array, period: tuple[int, int], psf: Psf, axis: int, centre_px: float
+) -> tuple[Array, Array]:
+    """cos of q (x - centre) at consecutive pixels, and its derivative in the centre: (n, K)."""
+    first = int(pixels[0])
+    cos, sin, q = _waves(len(pixels), period, psf, axis)
+    away = q * (centre_px - first)
+    cos_away, sin_away = np.cos(away), np.sin(away)
+    return cos * cos_away + sin * sin_away, sin * (q * cos_away) - cos * (q * sin_away)
+
+
 def unit_object(
     patch: Patch, psf: Psf, shape: Shape, centre_px: tuple[float, float], radius_px: float
 ) -> tuple[Array, Array, Array, Array]:
     """Image of a unit object on the patch, and its derivatives by row, column and radius."""
-    space = k_space(patch.period, psf)
     spectrum, by_radius = spectrum_near(patch.period, psf, shape, radius_px)
-    q_row, q_col = 2 * np.pi * space.k_row, 2 * np.pi * space.k_col
-    angle_row = np.outer(patch.rows - centre_px[0], q_row)
-    angle_col = np.outer(patch.cols - centre_px[1], q_col)
-    cos_row, cos_col = np.cos(angle_row), np.cos(angle_col)
-    half = spectrum @ cos_col.T
-    value = cos_row @ half
-    by_row = (np.sin(angle_row) * q_row) @ half
-    by_col = cos_row @ (spectrum @ (np.sin(angle_col) * q_col).T)
-    return value, by_row, by_col, cos_row @ (by_radius @ cos_col.T)
+    row, d_row = _displaced_waves(patch.rows, patch.period, psf, 0, centre_px[0])
+    col, d_col = _displaced_waves(patch.cols, patch.period, psf, 1, centre_px[1])
+    half = spectrum @ col.T
+    return row @ half, d_row @ half, row @ (spectrum @ d_col.T), row @ (by_radius @ col.T)

@@ -9,6 +9,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import cholesky
 from scipy.special import i0e, i1e
 
 from sr_engine.psf import Psf
@@ -80,6 +81,38 @@ def correlation(period: tuple[int, int], psf: Psf, reach: int) -> Array:
     along = np.cos(2 * np.pi * np.outer(lags, k_col))
     covariance = across @ power @ along.T
     return np.asarray(covariance / covariance[0, 0])
+
+
+_WHITE_FLOOR = 0.02  # share of noise power taken as white: what was never sampled stays finite
+
+
+@lru_cache(maxsize=32)
+def _pixel_correlation(
+    period: tuple[int, int], psf: Psf, shape: tuple[int, int], packed_mask: bytes
+) -> Array:
+    """(n, n) correlation of one noise channel between the pixels of a mask."""
+    bits = np.unpackbits(np.frombuffer(packed_mask, np.uint8), count=shape[0] * shape[1])
+    row, col = np.nonzero(bits.reshape(shape))
+    table = correlation(period, psf, max(shape))
+    return np.asarray(table[np.abs(row[:, None] - row), np.abs(col[:, None] - col)])
+
+
+def colour_factor(
+    period: tuple[int, int], psf: Psf, mask: NDArray[np.bool_], expected: Moments, sigma: float
+) -> Array:
+    """Lower Cholesky factor (n, n) of the correlation of magnitudes at the pixels of a mask.
+
+    A magnitude far from zero follows one channel (correlation rho), one without signal goes
+    with the power of both (rho^2, near enough): the first two terms of the expansion of the
+    magnitude in Hermite polynomials, each with the share of the variance that it has.
+    """
+    shape = (mask.shape[0], mask.shape[1])
+    rho = _pixel_correlation(period, psf, shape, np.packbits(mask).tobytes())
+    linear = np.minimum(np.abs(expected.slope) * sigma / np.sqrt(expected.variance), 1.0)
+    rest = np.sqrt(1 - linear**2)
+    matrix = (1 - _WHITE_FLOOR) * (np.outer(linear, linear) * rho + np.outer(rest, rest) * rho**2)
+    matrix[np.diag_indices_from(matrix)] += _WHITE_FLOOR
+    return np.asarray(cholesky(matrix, lower=True, check_finite=False))
 
 
 def is_white(psf: Psf) -> bool:

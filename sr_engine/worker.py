@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, cast, get_args
 
 import numpy as np
 import structlog
@@ -22,14 +22,16 @@ from case_record.rows import Measurement, SliceRow
 from dicom_listener.pixels import magnitude_pixels
 from dicom_listener.reasons import UnusableError
 from room_config.load import Config
-from sr_engine.errors import EngineError, SingularShiftSetError
+from sr_engine.errors import EngineError, OutsideGateError, SingularShiftSetError
 from sr_engine.geometry import SliceGeometry
-from sr_engine.localize import Localization, localize
+from sr_engine.hough import HoughSettings
+from sr_engine.localize import SEARCH_PX, Localization, localize
+from sr_engine.paper import PaperMethod, PaperSettings, localize_paper
 from sr_engine.reconstruct import reconstruct
 
 IMAGES = "images"
+ALIVE = "worker.alive"
 _SAME_PLACE = 1e-6
-_NEAR_PX = 3.0
 log = structlog.get_logger()
 
 
@@ -55,11 +57,16 @@ class Frames:
 
 
 def serve(config: Config, should_stop: Callable[[], bool]) -> None:
-    """Work until `should_stop`; looks for requests every `poll_s`."""
+    """Work until `should_stop`; looks for requests every `poll_s`, says every second: alive."""
     case_dir = config.room.case_dir
+    alive = case_dir / ALIVE
+    said_s = 0.0
     with CaseRecord(case_dir, create=True) as record, Presence(case_dir, "worker") as presence:
         while not should_stop():
             presence.beat()
+            if time.monotonic() - said_s > 1.0:
+                alive.touch()
+                said_s = time.monotonic()
             for request in record.requested_measurements():
                 measure(record, request, config.worker.reconstruction_factor)
             time.sleep(config.worker.poll_s)
@@ -70,7 +77,7 @@ def measure(record: CaseRecord, request: Measurement, factor: int) -> None:
     number = request.measurement_id
     try:
         frames = gather_frames(record, request)
-        found = _localize(frames, request)
+        found = localize_request(frames, request.method, request.request)
         result = describe_result(frames, found)
         result["reconstruction"] = _reconstruction(record.case_dir, number, frames, factor)
     except (EngineError, UnusableSlicesError, UnusableError) as error:
@@ -150,10 +157,14 @@ def describe_result(frames: Frames, found: Localization) -> dict[str, Any]:
             "col_direction": list(geometry.col_direction),
             "spacing_mm": list(geometry.spacing_mm),
         },
-        "scan_s": float(
-            sum((s.acquired_to_s or 0.0) - (s.acquired_from_s or 0.0) for s in frames.slices)
-        ),
+        "scan_s": sum(_scan_s(row.header) for row in frames.slices),
     }
+
+
+def _scan_s(header: Mapping[str, Any]) -> float:
+    """How long the scanner took for this slice, by its own clock; 0 where it does not say."""
+    interval = header.get("interval")
+    return float(interval["end_s"] - interval["start_s"]) if interval else 0.0
 
 
 def _code_of(error: EngineError | UnusableSlicesError | UnusableError) -> str:
@@ -164,34 +175,50 @@ def _code_of(error: EngineError | UnusableSlicesError | UnusableError) -> str:
     return str(error.reason)
 
 
-def _localize(frames: Frames, request: Measurement) -> Localization:
-    low_mm, high_mm = request.request["radius_mm"]
-    spacing = float(np.mean(frames.geometry.spacing_mm))
-    radius_px = (low_mm / spacing, high_mm / spacing)
-    expected_mm = request.request["expected_plane_mm"]
-    if expected_mm is None:
-        return localize(
-            frames.pixels, frames.shifts_px, radius_px=radius_px, method=request.method
+def localize_request(frames: Frames, method: str, request: Mapping[str, Any]) -> Localization:
+    """Localize the fiducial where it is expected, or anywhere if nothing is known of its place.
+
+    request: radius_mm (low, high), expected_plane_mm and gate_mm (both None: look everywhere),
+    shift_sigma_mm (standard deviation of a commanded shift, one axis). Raises an EngineError.
+    """
+    spacing = np.array(frames.geometry.spacing_mm)
+    mean_mm = float(np.mean(spacing))
+    low_mm, high_mm = request["radius_mm"]
+    expected_px = gate_px = None
+    if request["expected_plane_mm"] is not None:
+        expected_mm = np.array(request["expected_plane_mm"])
+        expected_px = (expected_mm - _plane_origin_mm(frames.geometry)) / spacing
+        gate_px = float(request["gate_mm"]) / mean_mm
+    # an expectation that is wider than the engine's own search only serves to refuse
+    near = gate_px is not None and gate_px <= SEARCH_PX
+    radius_px = (low_mm / mean_mm, high_mm / mean_mm)
+    start_px, start_gate_px = (expected_px, gate_px) if near else (None, None)
+    if method in get_args(PaperMethod):
+        found = localize_paper(
+            frames.pixels,
+            frames.shifts_px,
+            cast(PaperMethod, method),
+            start_px=start_px,
+            gate_px=start_gate_px,
+            settings=PaperSettings(HoughSettings(radius_px)),
         )
-    origin = _plane_origin_mm(frames.geometry)
-    expected_px = (np.array(expected_mm) - origin) / np.array(frames.geometry.spacing_mm)
-    gate_px = float(request.request["gate_mm"]) / spacing
-    # a start point must be near; with a wide gate the object is looked for, then held against it
-    near = gate_px <= _NEAR_PX
-    found = localize(
-        frames.pixels,
-        frames.shifts_px,
-        start_px=expected_px if near else None,
-        radius_px=radius_px,
-        method=request.method,
-    )
-    miss_px = float(np.linalg.norm(np.asarray(found.centre_px) - expected_px))
-    if not miss_px <= gate_px:
-        raise UnusableSlicesError(
-            "outside_gate",
-            f"the round object found is {miss_px * spacing:.1f} mm from where the fiducial is "
-            f"expected; at most {gate_px * spacing:.1f} mm are believed",
+    else:
+        found = localize(
+            frames.pixels,
+            frames.shifts_px,
+            start_px=start_px,
+            gate_px=start_gate_px,
+            radius_px=radius_px,
+            method=method,
+            shift_sigma_px=float(request.get("shift_sigma_mm", 0.0)) / mean_mm,
         )
+    if expected_px is not None and gate_px is not None and not near:
+        miss_px = float(np.linalg.norm(np.asarray(found.centre_px) - expected_px))
+        if not miss_px <= gate_px:
+            raise OutsideGateError(
+                f"the round object found is {miss_px * mean_mm:.1f} mm from where the fiducial is "
+                f"expected; at most {gate_px * mean_mm:.1f} mm are believed"
+            )
     return found
 
 

@@ -62,12 +62,15 @@ class EmulatedControllers:
         self._server = EmulatorServer(bus, PseudoTerminal())
         self.url = self._server.wire.url
         self._running = True
+        self.last_moving_s = 0.0
         self._thread = threading.Thread(target=self._serve, name="controllers", daemon=True)
         self._thread.start()
 
     def _serve(self) -> None:
         while self._running:
             self._server.serve_once()
+            if self.moving:
+                self.last_moving_s = time.monotonic()
 
     @property
     def moving(self) -> bool:
