@@ -16,6 +16,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
+from case_record.presence import Presence
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
 from dicom_listener.pixels import magnitude_pixels
@@ -57,10 +58,12 @@ class Frames:
 
 def serve(config: Config, should_stop: Callable[[], bool]) -> None:
     """Work until `should_stop`; looks for requests every `poll_s`, says every second: alive."""
-    alive = config.room.case_dir / ALIVE
+    case_dir = config.room.case_dir
+    alive = case_dir / ALIVE
     said_s = 0.0
-    with CaseRecord(config.room.case_dir, create=True) as record:
+    with CaseRecord(case_dir, create=True) as record, Presence(case_dir, "worker") as presence:
         while not should_stop():
+            presence.beat()
             if time.monotonic() - said_s > 1.0:
                 alive.touch()
                 said_s = time.monotonic()
