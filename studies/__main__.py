@@ -1,0 +1,5 @@
+"""`python -m studies ...`, the same as `autospine study ...`."""
+
+from studies.command_line import app
+
+app(prog_name="autospine study")

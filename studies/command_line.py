@@ -1,0 +1,148 @@
+"""`autospine study ...`: the paper's experiments repeated, and ours beside them."""
+
+from __future__ import annotations
+
+import json
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+app = typer.Typer(no_args_is_help=True, help="Repeat the paper's experiments, ours beside them.")
+
+BAD_INPUT = 2
+
+
+@app.callback()
+def study() -> None:
+    """Repeat the paper's experiments, ours beside them."""
+
+
+@app.command()
+def numerical(
+    trials: Annotated[int, typer.Option(help="Positions of the circle.")] = 100,
+    seed: Annotated[int, typer.Option(help="Of every random draw; same seed, same numbers.")] = 1,
+    out: Annotated[Path | None, typer.Option(help="Folder for CSV, PNG and SVG.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="JSON instead of tables.")] = False,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler, as tcp://HOST:PORT.")
+    ] = None,
+    map_trials: Annotated[int, typer.Option(help="A cell of the map; 0 leaves it out.")] = 10,
+    radius: Annotated[float, typer.Option(help="Of the circle, px of the base frame.")] = 4.0,
+    snr: Annotated[float, typer.Option(help="Amplitude over noise per channel.")] = 20.0,
+    blur: Annotated[float, typer.Option(help="Sigma of the Gaussian blur, px.")] = 0.2,
+    sensitivity: Annotated[float, typer.Option(help="Of the circle finding, 0 to 1.")] = 0.85,
+    shift_set: Annotated[
+        str, typer.Option(help="paper (random), quarter, half or lattice5.")
+    ] = "paper",
+) -> None:
+    """The paper's Table I: base frame, bicubic and SR beside the maximum-likelihood fit."""
+    with _one_line_errors():
+        _check(trials, map_trials, seed, radius, snr, blur)
+        _run_numerical(
+            trials,
+            map_trials,
+            {
+                "seed": seed,
+                "radius_px": radius,
+                "snr": snr,
+                "blur_sigma_px": blur,
+                "sensitivity": sensitivity,
+                "shift_set": shift_set,
+            },
+            out,
+            as_json,
+            scheduler,
+        )
+
+
+def _run_numerical(
+    trials: int,
+    map_trials: int,
+    parameters: dict[str, object],
+    out: Path | None,
+    as_json: bool,
+    scheduler: str | None,
+) -> None:
+    # The matrices are small: threads would only wait for each other. Before numpy is loaded.
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
+    # Loaded here, so that the command's help costs nothing.
+    from rich.console import Console
+
+    from studies import cluster, numerical_figures, numerical_report, numerical_study
+    from studies.numerical import StudyPoint
+
+    point = StudyPoint(**parameters)  # type: ignore[arg-type]
+    _check_point(point)
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    total = numerical_study.trials_in_all(trials, map_trials)
+    with cluster.mapper(scheduler) as mapper, _progress_bar("trials", total) as advance:
+        study = numerical_study.run_study(point, trials, map_trials, mapper, advance)
+    files: list[Path] = []
+    if out is not None:
+        files = numerical_report.write_csv(study, out) + numerical_figures.draw_all(study, out)
+    if as_json:
+        typer.echo(json.dumps(numerical_report.as_json(study, files), allow_nan=False))
+        return
+    console = Console()
+    numerical_report.print_tables(study, console)
+    for file in files:
+        console.print(f"written: {file}", highlight=False)
+
+
+def _check(trials: int, map_trials: int, seed: int, radius: float, snr: float, blur: float) -> None:
+    checks = (
+        (2 <= trials <= 1_000_000, f"--trials is {trials}; 2 to 1000000 are possible"),
+        (
+            map_trials == 0 or 2 <= map_trials <= 100_000,
+            f"--map-trials is {map_trials}; 0 or 2 to 100000 are possible",
+        ),
+        (0 <= seed < 2**63, f"--seed is {seed}; it must not be negative"),
+        (1.5 <= radius <= 20.0, f"--radius is {radius:g} px; 1.5 to 20 is possible"),
+        (1.0 <= snr <= 1e6, f"--snr is {snr:g}; 1 to 1000000 is possible"),
+        (0.0 <= blur <= 3.0, f"--blur is {blur:g} px; 0 to 3 is possible"),
+    )
+    for holds, message in checks:
+        if not holds:
+            raise ValueError(message)
+
+
+def _check_point(point: object) -> None:
+    """What only the engine knows: the sensitivity's range, the names of the shift sets."""
+    from sr_engine.shiftset import named
+    from studies.numerical import StudyPoint
+
+    assert isinstance(point, StudyPoint)
+    _ = point.hough
+    if point.shift_set != "paper":
+        named(point.shift_set)
+
+
+@contextmanager
+def _one_line_errors() -> Iterator[None]:
+    """Bad input ends in one line on stderr and exit code 2."""
+    try:
+        yield
+    except (ValueError, OSError) as error:
+        typer.echo(f"autospine study: {' '.join(str(error).split())}", err=True)
+        raise typer.Exit(BAD_INPUT) from error
+
+
+@contextmanager
+def _progress_bar(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A bar on a terminal, nothing in a pipe."""
+    if not sys.stderr.isatty():
+        yield lambda done: None
+        return
+    from rich.console import Console
+    from rich.progress import Progress
+
+    with Progress(console=Console(stderr=True), transient=True) as progress:
+        task = progress.add_task(what, total=total)
+        yield lambda done: progress.update(task, advance=done)
