@@ -45,7 +45,7 @@ LEAST_EXPLAINED = 0.3  # of the variance near a given start, by the matched filt
 AMBIGUOUS_RATIO = 0.9  # a second candidate of this share of the best score is as good
 MINIMUM_EXPLAINED = 60.0  # chi2 that an object must take away to be one
 CONSISTENCY_P = 1e-5  # frames that agree look as bad as this once in 100,000 measurements
-MODEL_FLOOR_PX = 0.005  # what an imperfect point spread may do to one frame; check only
+MODEL_FLOOR_PX = 0.01  # what an imperfect point spread may do to one frame; check only
 FOLDING_MARGIN_PX = 6.0
 LARGEST_PERIOD_PX = 160  # ringing that comes round from farther away is below 1e-4 of the object
 
