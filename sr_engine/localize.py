@@ -39,6 +39,7 @@ from sr_engine.signal import Pixels
 Array = NDArray[np.float64]
 
 MARGIN_PX = 4.0  # of surroundings that are fitted with the object
+INNER_BAND_PX = 10.0  # inside of the edge
 SEARCH_PX = 3.0  # how far from a given start the object may be
 DEFAULT_RADII_PX = (1.5, 12.0)
 LEAST_EXPLAINED = 0.3  # of the variance near a given start, by the matched filter
@@ -167,6 +168,8 @@ def region_of_interest(
 ) -> Pixels:
     """The pixels within radius + margin of the guess (row, col, radius), clipped at the frame.
 
+    Of a large object only a band inside of the edge: the rest tells nothing of the centre, and
+    shading that no straight line follows would only mislead.
     Raises ObjectAtBorderError where the object itself is not wholly inside of the frame.
     """
     row, col, radius = guess
@@ -179,7 +182,8 @@ def region_of_interest(
         )
     (r0, r1), (c0, c1) = spans
     rows, cols = np.arange(r0, r1, dtype=float), np.arange(c0, c1, dtype=float)
-    mask = np.hypot(rows[:, None] - row, cols[None, :] - col) <= reach
+    distance = np.hypot(rows[:, None] - row, cols[None, :] - col)
+    mask = (distance <= reach) & (distance >= radius - INNER_BAND_PX)
     period = _period((frame.shape[0], frame.shape[1]), reach, psf)
     return Pixels(Patch(rows, cols, period), frame[r0:r1, c0:c1], mask)
 
