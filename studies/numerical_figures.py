@@ -48,7 +48,7 @@ def draw_scatter(study: NumericalStudy) -> Figure:
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, len(METHODS), squeeze=False)
     shown = [m for m in METHODS if m in study.summaries]
-    limit = 1.05 * max(float(np.abs(errors_px(study.trials, m)).max()) for m in shown)
+    limit = 1.35 * max(float(np.abs(errors_px(study.trials, m)).max()) for m in shown)
     for column, method in enumerate(METHODS):
         above, below = axes[0, column], axes[1, column]
         above.set_title(LABELS[method], fontsize=11)
