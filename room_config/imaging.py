@@ -17,7 +17,7 @@ class ImagingConfig(Section):
     )
     start_region_px: tuple[float, float, float, float] | None = Field(
         default=None,
-        description="Row and column bounds (r0, c0, r1, c1) within which the fiducial is looked for "
+        description="Row and column bounds (r0, c0, r1, c1) in which the fiducial is looked for "
         "while nothing is known of its position; absent: the whole slice.",
     )
     position_gate_mm: float = Field(

@@ -1,6 +1,8 @@
 """`[listener]`: the C-STORE service and the assignment of slices."""
 
-from pydantic import Field
+from pathlib import Path
+
+from pydantic import Field, model_validator
 
 from room_config.section import Section
 
@@ -9,8 +11,92 @@ class ListenerConfig(Section):
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
     port: int = Field(default=11112, ge=0, le=65535, description="0: any free port.")
     ae_title: str = Field(default="AUTOSPINE", min_length=1, max_length=16)
+    require_called_ae_title: bool = Field(
+        default=True, description="True: refuse associations that call another AE title."
+    )
+    calling_ae_titles: tuple[str, ...] = Field(
+        default=(), description="AE titles that may send; none listed: any."
+    )
+    peer_networks: tuple[str, ...] = Field(
+        default=(), description="Addresses or CIDR networks that may send; none listed: any."
+    )
+    any_storage_class: bool = Field(
+        default=True,
+        description="True: store every kind of object and set aside what is no MR image; "
+        "False: refuse it at negotiation.",
+    )
+    max_associations: int = Field(default=16, ge=1, le=256)
+    acse_timeout_s: float = Field(default=10.0, gt=0, description="To open an association.")
+    dimse_timeout_s: float = Field(default=30.0, gt=0, description="Between parts of a message.")
+    network_timeout_s: float = Field(
+        default=60.0, gt=0, description="An association on which nothing arrives is ended."
+    )
+    max_object_mib: int = Field(default=512, ge=1, description="Largest object that is stored.")
+    min_free_mib: int = Field(
+        default=1024,
+        ge=0,
+        description="Below this much free disk slices are refused (0xA700); alarm at twice that.",
+    )
+    tls_certificate: Path | None = Field(
+        default=None, description="PEM file; with tls_key and tls_authority: mutual TLS."
+    )
+    tls_key: Path | None = Field(default=None, description="PEM file of the private key.")
+    tls_authority: Path | None = Field(
+        default=None, description="PEM file of the authority that signs the senders' certificates."
+    )
+    scanner_time_zone: str = Field(
+        default="",
+        description="IANA name of the zone of scanners that do not say; empty: this computer's.",
+    )
     guard_s: float = Field(
         default=0.05,
         ge=0,
         description="A hold is shrunk by this at both ends before a slice may belong to it.",
     )
+    prompt_delay_s: float = Field(
+        default=3.0,
+        gt=0,
+        description="The promptest slice arrives this soon after its acquisition ended; bounds "
+        "the offset of the scanner's clock where no sync is given.",
+    )
+    longest_acquisition_s: float = Field(
+        default=30.0,
+        gt=0,
+        description="No acquisition lasts longer that comes without its duration; a slice without "
+        "one is used only after the robot has stood that long.",
+    )
+    largest_clock_offset_s: float = Field(
+        default=600.0,
+        gt=0,
+        description="Without clock_offset_s: a scanner's clock further off is not believed.",
+    )
+    late_limit_s: float = Field(
+        default=120.0,
+        gt=0,
+        description="A slice that seems later than this is set aside: its clock may have jumped.",
+    )
+    clock_offset_s: float | None = Field(
+        default=None, description="Explicit sync: our clock minus the scanner's."
+    )
+    clock_uncertainty_s: float = Field(
+        default=1.0, ge=0, description="Uncertainty of clock_offset_s."
+    )
+    arrival_mode: bool = Field(
+        default=False,
+        description="True: no usable acquisition times here; the operator confirms each "
+        "acquisition, and every result is marked.",
+    )
+    allow_derived: bool = Field(default=False, description="True: use derived images too.")
+    metrics_port: int | None = Field(
+        default=None, ge=0, le=65535, description="Serve /metrics on localhost; absent: do not."
+    )
+    retention_days: float = Field(
+        default=0.0, ge=0, description="Remove set-aside files after so many days; 0: keep all."
+    )
+
+    @model_validator(mode="after")
+    def _tls_is_whole(self) -> "ListenerConfig":
+        given = [self.tls_certificate, self.tls_key, self.tls_authority]
+        if any(given) and not all(given):
+            raise ValueError("tls_certificate, tls_key and tls_authority belong together")
+        return self

@@ -27,6 +27,8 @@ ENVIRONMENT_PREFIX = "AUTOSPINE_"
 class ConfigError(Exception):
     """The configuration cannot be used; the text is one line that names file and key."""
 
+    exit_code = 2
+
 
 class Config(BaseModel):
     """The whole file. `[bridge]` and `[virtual]` are checked by those who own them."""

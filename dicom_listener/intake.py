@@ -1,0 +1,409 @@
+"""From the inbox into the case record: header, duplicates, assignment, one row a frame.
+
+Runs in the listener's process, one file after the other. A file whose rows are in the record is
+done; any other in the inbox is taken, also one that was received just before a crash.
+"""
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from datetime import tzinfo
+from pathlib import Path
+from typing import Any
+
+import structlog
+
+from case_record.record import CaseRecord
+from case_record.rows import Hold, NewSlice, SliceRow
+from dicom_listener.assign import (
+    AssignRules,
+    Decision,
+    HoldWindow,
+    Known,
+    Pending,
+    assign,
+)
+from dicom_listener.clock import ClockRules, OffsetBounds, ScannerClock, Sync, observe
+from dicom_listener.header import Slice, read_header
+from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope
+from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.pixels import check_pixels
+from dicom_listener.reasons import Reason, SetAside, UnusableError
+from dicom_listener.slice_rows import (
+    outcome_of,
+    row_of,
+    row_without_header,
+    slice_from_record,
+)
+from dicom_listener.times import TimeFrame
+from dicom_listener.usable import SliceRules, why_not_usable
+
+SOURCE = "listener"
+_HOLDS_LOOKED_AT = 64
+_EVENTS_AT_ONCE = 1000
+
+log = structlog.get_logger("listener")
+
+
+@dataclass(frozen=True)
+class IntakeRules:
+    """What is usable, where it belongs, and what is known of the scanners' clocks beforehand."""
+
+    slices: SliceRules = field(default_factory=SliceRules)
+    assign: AssignRules = field(default_factory=AssignRules)
+    clock: ClockRules = field(default_factory=ClockRules)
+    zone: tzinfo | None = None
+    sync: Sync | None = None
+    retention_s: float = 0.0
+
+
+class Intake:
+    """Owns this process's connection to the record; use it in the thread that made it."""
+
+    def __init__(
+        self, record: CaseRecord, inbox: Inbox, rules: IntakeRules, metrics: ListenerMetrics
+    ) -> None:
+        self._record = record
+        self._inbox = inbox
+        self._rules = rules
+        self._metrics = metrics
+        self._clocks: dict[str, ScannerClock] = {}
+        self._late_scanners: set[str] = set()
+        self._known: dict[int, Known] = {}
+        self._pending: dict[int, Slice] = {}
+        self._confirmed: set[int] = set()
+        self._done: set[str] = set()
+        self._seen_event_id = 0
+        self._seen_version = -1
+        self._remember()
+
+    def _remember(self) -> None:
+        """Rebuild from the record what an earlier run of this process knew."""
+        for row in self._record.slices():
+            self._done.add(row.path)
+            slice_ = self._slice_of(row)
+            if slice_ is None:
+                continue
+            self._observe(slice_, row.received_s)
+            if row.state == "pending":
+                self._pending[row.slice_id] = slice_
+            if why_not_usable(slice_, self._rules.slices) is None:
+                self._known[row.slice_id] = Known(
+                    slice_, row.received_s, row.hold_id, row.reason_code
+                )
+        self._read_events(replaying=True)
+
+    @staticmethod
+    def _slice_of(row: SliceRow) -> Slice | None:
+        return slice_from_record(row.header) if "sop_class_uid" in row.header else None
+
+    # The loop's pieces
+
+    def take_left_over(self) -> int:
+        """Take every inbox file that the record does not have yet; return how many."""
+        files = [path for path in self._inbox.files() if self._named(path) not in self._done]
+        for path in files:
+            self.take(path)
+        return len(files)
+
+    def look_at_record(self) -> None:
+        """Follow what the other processes wrote: holds, confirmations, syncs, re-assignments."""
+        version = self._record.data_version()
+        if version == self._seen_version:
+            return
+        self._seen_version = version
+        self._read_events(replaying=False)
+        self._decide_pending()
+
+    def take(self, path: Path) -> None:
+        """Record one inbox file. Never raises for what is in the file."""
+        name = self._named(path)
+        if name in self._done or not path.exists():
+            return
+        try:
+            envelope = self._envelope(path)
+        except NotFromInboxError as error:
+            self._done.add(name)
+            self.alarm("foreign_file", str(error))
+            return
+        before = self._record.slices(sop_instance_uid=envelope.sop_instance_uid)
+        if any(row.sha256 == envelope.sha256 for row in before):
+            self._drop_duplicate(path, envelope)
+            return
+        rows, slices = self._rows_of(path, name, envelope, conflict=bool(before))
+        self._write(rows, slices, envelope)
+        self._done.add(name)
+        self._metrics.intake_seconds.observe(max(0.0, time.time() - envelope.received_s))
+
+    def remove_old(self, now_s: float) -> int:
+        """Remove set-aside files past their retention; rows and events stay. Return how many."""
+        if not self._rules.retention_s > 0:
+            return 0
+        limit_s = now_s - self._rules.retention_s
+        kept = {row.path for row in self._record.slices() if row.state != "quarantined"}
+        old = {
+            row.path
+            for row in self._record.slices(state="quarantined")
+            if row.received_s < limit_s and row.path not in kept
+        }
+        removed = [name for name in sorted(old) if (self._record.case_dir / name).exists()]
+        for name in removed:
+            (self._record.case_dir / name).unlink()
+        if removed:
+            self._event("files_removed", {"count": len(removed), "paths": removed[:100]})
+        return len(removed)
+
+    def alarm(self, kind: str, text: str) -> None:
+        """Count, log and record something that a person should know of."""
+        self._metrics.alarms.labels(kind).inc()
+        log.warning(kind, text=text)
+        self.note_alarm(kind, text)
+
+    def note_alarm(self, kind: str, text: str) -> None:
+        """Record an alarm that was counted and logged where it arose."""
+        self._event("alarm", {"alarm": kind, "text": text})
+
+    # One file
+
+    def _named(self, path: Path) -> str:
+        return path.relative_to(self._record.case_dir).as_posix()
+
+    def _envelope(self, path: Path) -> Envelope:
+        envelope, _ = read_envelope(path)
+        if envelope.sop_instance_uid:
+            return envelope
+        return replace(envelope, sop_instance_uid=f"none-{envelope.sha256[:32]}")
+
+    def _drop_duplicate(self, path: Path, envelope: Envelope) -> None:
+        """The same instance again with the same bytes: nothing to do, and one file is enough."""
+        kept = self._record.slices(
+            sop_instance_uid=envelope.sop_instance_uid, sha256=envelope.sha256
+        )[0]
+        kept_path = self._record.case_dir / kept.path
+        if kept_path != path and kept_path.exists():
+            path.unlink()
+        self._done.add(self._named(path))
+        self._metrics.duplicates.inc()
+        self._event("duplicate_slice", {"sop_instance_uid": envelope.sop_instance_uid})
+
+    def _rows_of(
+        self, path: Path, name: str, envelope: Envelope, conflict: bool
+    ) -> tuple[list[NewSlice], list[Slice | None]]:
+        try:
+            slices = self._read(path, envelope)
+            problems = check_pixels(path, slices)
+        except UnusableError as error:
+            reason = _without_path(error.reason, path)
+            return [row_without_header(envelope, name, reason)], [None]
+        self._observe_first(slices, envelope)
+        rows: list[NewSlice] = []
+        for slice_ in slices:
+            against = self._against(slice_, envelope, problems, conflict)
+            decision = against or self._assign(slice_, envelope.received_s, self._known_now(rows))
+            rows.append(row_of(slice_, envelope, name, decision))
+        return rows, list(slices)
+
+    def _read(self, path: Path, envelope: Envelope) -> list[Slice]:
+        return read_header(path, TimeFrame(self._rules.zone, envelope.received_s))
+
+    def _against(
+        self,
+        slice_: Slice,
+        envelope: Envelope,
+        problems: dict[int, UnusableError],
+        conflict: bool,
+    ) -> SetAside | None:
+        if conflict:
+            return SetAside(
+                Reason.UID_CONFLICT, "an instance with this UID and other bytes is already here"
+            )
+        stated = slice_.sop_instance_uid
+        if stated and stated != envelope.sop_instance_uid:
+            return SetAside(
+                Reason.UID_CONTRADICTION, "the data set has another UID than it was sent under"
+            )
+        unusable = why_not_usable(slice_, self._rules.slices)
+        if unusable is None and slice_.frame in problems:
+            return problems[slice_.frame].reason
+        return unusable
+
+    def _known_now(self, rows: Sequence[NewSlice]) -> list[Known]:
+        """Known slices, and the frames of the same file that were decided just now."""
+        siblings = [
+            Known(slice_from_record(row.header), row.received_s, row.hold_id, row.reason_code)
+            for row in rows
+            if row.state == "assigned"
+        ]
+        return [*self._known.values(), *siblings]
+
+    def _assign(self, slice_: Slice, received_s: float, known: Sequence[Known]) -> Decision:
+        return assign(
+            slice_,
+            received_s,
+            self._holds(),
+            known,
+            self._offset(slice_, received_s),
+            self._rules.assign,
+        )
+
+    def _holds(self) -> list[HoldWindow]:
+        holds = self._record.holds()[-_HOLDS_LOOKED_AT:]
+        return [window_of(hold, hold.hold_id in self._confirmed) for hold in holds]
+
+    def _write(self, rows: list[NewSlice], slices: list[Slice | None], envelope: Envelope) -> None:
+        with self._record.transaction():
+            stored = [self._record.add_slice(row) for row in rows]
+            self._event("slice_received", _event_body(rows, envelope))
+        for row, slice_ in zip(stored, slices, strict=True):
+            self._metrics.decided.labels(row.state, row.reason_code).inc()
+            if slice_ is None:
+                continue
+            if row.state == "pending":
+                self._pending[row.slice_id] = slice_
+            if why_not_usable(slice_, self._rules.slices) is None:
+                self._known[row.slice_id] = Known(
+                    slice_, row.received_s, row.hold_id, row.reason_code
+                )
+        if any(row.reason_code == Reason.UID_CONFLICT for row in rows):
+            self.alarm("same_uid_other_bytes", f"{envelope.sop_instance_uid}: both are kept")
+
+    # Clocks
+
+    def _observe_first(self, slices: Sequence[Slice], envelope: Envelope) -> None:
+        for slice_ in slices:
+            for kind, text in self._observe(slice_, envelope.received_s):
+                self.alarm(kind, f"{slice_.scanner}: {text}")
+
+    def _observe(self, slice_: Slice, received_s: float) -> list[tuple[str, str]]:
+        if slice_.interval is None:
+            return []
+        clock = self._clocks.get(slice_.scanner, ScannerClock(sync=self._rules.sync))
+        seen = observe(clock, slice_.interval, received_s, self._rules.clock)
+        self._clocks[slice_.scanner] = seen.clock
+        alarms = [("clock_jump", seen.jump)] if seen.jump else []
+        if seen.late and slice_.scanner not in self._late_scanners:
+            alarms.append(("late_or_clock_jump", seen.late))  # once, until one is prompt again
+        (self._late_scanners.add if seen.late else self._late_scanners.discard)(slice_.scanner)
+        return alarms
+
+    def _offset(self, slice_: Slice, received_s: float) -> OffsetBounds | None:
+        clock = self._clocks.get(slice_.scanner)
+        if clock is None or slice_.interval is None:
+            return None
+        return clock.bounds_for(slice_.interval, received_s, self._rules.clock)
+
+    # What the other processes say
+
+    def _read_events(self, *, replaying: bool) -> None:
+        while events := self._record.events(self._seen_event_id, _EVENTS_AT_ONCE):
+            for event in events:
+                self._seen_event_id = event.event_id
+                self._heed(event.kind, event.body, replaying)
+
+    def _heed(self, kind: str, body: Any, replaying: bool) -> None:
+        if kind == "acquisition_confirmed":
+            self._confirmed.add(int(body["hold_id"]))
+        elif kind == "clock_sync":
+            sync = Sync(body["offset_s"], body["uncertainty_s"], body["at_s"])
+            for scanner in self._clocks:
+                self._clocks[scanner] = ScannerClock(sync=sync)
+            self._rules = replace(self._rules, sync=sync)
+        elif kind == "clock_reset":
+            self._clocks.clear()
+            self._rules = replace(self._rules, sync=None)
+        elif kind == "slice_reassigned" and not replaying:
+            self._follow(self._record.slice(int(body["slice_id"])))
+
+    def _follow(self, row: SliceRow) -> None:
+        """Somebody else decided about a slice."""
+        self._pending.pop(row.slice_id, None)
+        slice_ = self._slice_of(row)
+        if slice_ is not None:
+            self._known[row.slice_id] = Known(slice_, row.received_s, row.hold_id, row.reason_code)
+
+    def _decide_pending(self) -> None:
+        for slice_id, slice_ in list(self._pending.items()):
+            row = self._record.slice(slice_id)
+            if row.state != "pending":
+                self._follow(row)
+                continue
+            earlier = [known for id_, known in self._known.items() if id_ < slice_id]
+            later = [
+                known
+                for id_, known in self._known.items()
+                if id_ > slice_id and known.hold_id is not None
+            ]
+            decision = self._assign(slice_, row.received_s, [*earlier, *later])
+            state, hold_id, code, text = outcome_of(decision)
+            if (state, code) == (row.state, row.reason_code):
+                continue
+            self._decide(row, decision, (state, hold_id, code, text))
+
+    def _decide(
+        self, row: SliceRow, decision: Decision, outcome: tuple[str, int | None, str, str]
+    ) -> None:
+        state, hold_id, code, text = outcome
+        with self._record.transaction():
+            self._record.decide_slice(
+                row.slice_id,
+                state=state,
+                hold_id=hold_id,
+                reason_code=code,
+                reason=text,
+                decided_by=SOURCE,
+            )
+            body = {"slice_id": row.slice_id, "state": state, "hold_id": hold_id, "reason": text}
+            self._event("slice_decided", body)
+        self._metrics.decided.labels(state, code).inc()
+        if not isinstance(decision, Pending):
+            slice_ = self._pending.pop(row.slice_id)
+            self._known[row.slice_id] = Known(slice_, row.received_s, hold_id, code)
+
+    def _event(self, kind: str, body: dict[str, Any]) -> None:
+        self._record.append_event(kind, body, source=SOURCE)
+
+
+def reassign(record: CaseRecord, slice_id: int, hold_id: int | None, who: str, why: str) -> None:
+    """An operator overrules: the slice belongs to this hold, or (None) to none. Who is recorded."""
+    with record.transaction():
+        record.decide_slice(
+            slice_id,
+            state="quarantined" if hold_id is None else "assigned",
+            hold_id=hold_id,
+            reason_code="operator" if hold_id is None else "",
+            reason=why if hold_id is None else "",
+            decided_by=who,
+        )
+        body = {"slice_id": slice_id, "hold_id": hold_id, "why": why}
+        record.append_event("slice_reassigned", body, source="operator", who=who)
+
+
+def window_of(hold: Hold, confirmed: bool) -> HoldWindow:
+    return HoldWindow(
+        hold.hold_id,
+        hold.set_id,
+        hold.settled_at_s,
+        hold.ended_at_s,
+        hold.expected_slices,
+        confirmed,
+    )
+
+
+def _event_body(rows: Sequence[NewSlice], envelope: Envelope) -> dict[str, Any]:
+    first = rows[0]
+    return {
+        "sop_instance_uid": first.sop_instance_uid,
+        "path": first.path,
+        "frames": len(rows),
+        "assigned": sum(row.state == "assigned" for row in rows),
+        "state": first.state,
+        "hold_id": first.hold_id,
+        "reason_code": first.reason_code,
+        "reason": first.reason,
+        "from": envelope.calling_ae_title,
+        "received_s": envelope.received_s,
+    }
+
+
+def _without_path(reason: SetAside, path: Path) -> SetAside:
+    return SetAside(reason.code, reason.text.removeprefix(f"{path}: "))

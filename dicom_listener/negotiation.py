@@ -1,0 +1,127 @@
+"""Which presentation contexts we accept, and a readable account of what was negotiated."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from pydicom.pixels import get_decoder
+from pydicom.uid import (
+    UID,
+    DeflatedExplicitVRLittleEndian,
+    ExplicitVRBigEndian,
+    ExplicitVRLittleEndian,
+    ImplicitVRLittleEndian,
+)
+from pynetdicom import AE, AllStoragePresentationContexts
+from pynetdicom.association import Association
+from pynetdicom.presentation import PresentationContext
+
+from dicom_listener.quirks import MR_CLASSES
+
+VERIFICATION = "1.2.840.10008.1.1"
+_UNCOMPRESSED = (
+    ExplicitVRLittleEndian,
+    ImplicitVRLittleEndian,
+    DeflatedExplicitVRLittleEndian,
+    ExplicitVRBigEndian,
+)
+_COMPRESSED = (
+    "1.2.840.10008.1.2.5",  # RLE Lossless
+    "1.2.840.10008.1.2.4.57",  # JPEG Lossless
+    "1.2.840.10008.1.2.4.70",  # JPEG Lossless, selection value 1
+    "1.2.840.10008.1.2.4.80",  # JPEG-LS Lossless
+    "1.2.840.10008.1.2.4.90",  # JPEG 2000 Lossless
+    "1.2.840.10008.1.2.4.201",  # HTJ2K Lossless
+    "1.2.840.10008.1.2.4.202",  # HTJ2K Lossless RPCL
+    "1.2.840.10008.1.2.4.81",  # JPEG-LS Near-lossless
+    "1.2.840.10008.1.2.4.91",  # JPEG 2000
+    "1.2.840.10008.1.2.4.203",  # HTJ2K
+    "1.2.840.10008.1.2.4.50",  # JPEG Baseline
+    "1.2.840.10008.1.2.4.51",  # JPEG Extended
+)
+_RESULTS = {
+    1: "refused by us",
+    2: "refused, no reason",
+    3: "refused: this kind of object is not stored here",
+    4: "refused: none of these encodings can be decoded here",
+}
+_REJECTIONS = {
+    (1, 1, 1): "no reason given",
+    (1, 1, 3): "calling AE title not recognised",
+    (1, 1, 7): "called AE title not recognised",
+    (2, 3, 2): "too many associations",
+}
+
+
+def decodable_syntaxes() -> list[str]:
+    """Transfer syntaxes that we can decode, in the order in which we prefer them."""
+    compressed = [uid for uid in _COMPRESSED if get_decoder(UID(uid)).is_available]
+    return [*map(str, _UNCOMPRESSED), *compressed]
+
+
+def add_contexts(ae: AE, *, any_storage_class: bool) -> None:
+    """Tell the AE what it accepts: C-ECHO, MR images, and by switch every storage class."""
+    syntaxes = decodable_syntaxes()
+    ae.add_supported_context(VERIFICATION)
+    classes = set(MR_CLASSES)
+    if any_storage_class:
+        classes |= {str(context.abstract_syntax) for context in AllStoragePresentationContexts}
+    for uid in sorted(classes):
+        ae.add_supported_context(uid, syntaxes)
+
+
+@dataclass(frozen=True)
+class NegotiationReport:
+    """Who asked for what, and what we said."""
+
+    calling_ae_title: str
+    called_ae_title: str
+    peer: str
+    accepted: bool
+    lines: tuple[str, ...]
+
+    @property
+    def anything_refused(self) -> bool:
+        return not self.accepted or any("refused" in line for line in self.lines)
+
+    def __str__(self) -> str:
+        verdict = "accepted" if self.accepted else "rejected"
+        head = f"association of {self.calling_ae_title!r} ({self.peer}) to "
+        return "\n".join([f"{head}{self.called_ae_title!r}: {verdict}", *self.lines])
+
+
+def report_of(association: Association, why_rejected: str = "") -> NegotiationReport:
+    """Return the account of an association that was just accepted or rejected."""
+    request = association.requestor.primitive
+    accepted = {context.context_id: context for context in association.accepted_contexts}
+    refused = {context.context_id: context for context in association.rejected_contexts}
+    lines: Sequence[str]
+    if why_rejected:
+        lines = (why_rejected,)
+    else:
+        lines = [
+            _line(context, accepted.get(context.context_id), refused.get(context.context_id))
+            for context in request.presentation_context_definition_list
+        ]
+    return NegotiationReport(
+        calling_ae_title=str(request.calling_ae_title).strip(),
+        called_ae_title=str(request.called_ae_title).strip(),
+        peer=f"{association.requestor.address}:{association.requestor.port}",
+        accepted=not why_rejected,
+        lines=tuple(lines),
+    )
+
+
+def _line(
+    proposed: PresentationContext,
+    accepted: PresentationContext | None,
+    refused: PresentationContext | None,
+) -> str:
+    names = ", ".join(UID(uid).name for uid in proposed.transfer_syntax)
+    what = f"{UID(proposed.abstract_syntax).name} in {names}"
+    if accepted is not None:
+        return f"  {what}: accepted in {UID(accepted.transfer_syntax[0]).name}"
+    return f"  {what}: {_RESULTS.get(refused.result if refused else 2, 'refused')}"
+
+
+def rejection_text(result: int, source: int, diagnostic: int) -> str:
+    return _REJECTIONS.get((result, source, diagnostic), "rejected")

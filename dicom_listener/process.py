@@ -1,0 +1,184 @@
+"""The listener's process: wires service, inbox, intake and metrics; runs until told to stop."""
+
+import threading
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import dataclass
+from pathlib import Path
+from queue import Empty, SimpleQueue
+from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
+
+import structlog
+
+from case_record.presence import Presence
+from case_record.record import CaseRecord
+from dicom_listener.assign import AssignRules
+from dicom_listener.clock import ClockRules, Sync
+from dicom_listener.inbox import Inbox
+from dicom_listener.intake import Intake, IntakeRules
+from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.scp import Scp, ScpRules, tls_context
+from dicom_listener.usable import SliceRules
+from room_config.listener import ListenerConfig
+from room_config.load import Config, ConfigError
+
+_POLL_S = 0.02
+_HOUSEKEEPING_S = 10.0
+_MIB = 2**20
+
+log = structlog.get_logger("listener")
+
+
+@dataclass(frozen=True)
+class Ready:
+    """What a supervisor wants to know: the ports that were bound."""
+
+    port: int
+    metrics_port: int | None
+    ae_title: str
+
+
+def inbox_folder(case_dir: Path) -> Path:
+    return case_dir / "inbox"
+
+
+def scp_rules(config: ListenerConfig) -> ScpRules:
+    return ScpRules(
+        host=config.host,
+        port=config.port,
+        ae_title=config.ae_title,
+        require_called_ae_title=config.require_called_ae_title,
+        calling_ae_titles=config.calling_ae_titles,
+        peer_networks=config.peer_networks,
+        any_storage_class=config.any_storage_class,
+        max_associations=config.max_associations,
+        acse_timeout_s=config.acse_timeout_s,
+        dimse_timeout_s=config.dimse_timeout_s,
+        network_timeout_s=config.network_timeout_s,
+        max_object_bytes=config.max_object_mib * _MIB,
+    )
+
+
+def intake_rules(config: Config, now_s: float) -> IntakeRules:
+    listener = config.listener
+    sync = None
+    if listener.clock_offset_s is not None:
+        sync = Sync(listener.clock_offset_s, listener.clock_uncertainty_s, now_s)
+    return IntakeRules(
+        slices=SliceRules(
+            coronal_tolerance_deg=config.imaging.coronal_tolerance_deg,
+            allow_derived=listener.allow_derived,
+        ),
+        assign=AssignRules(
+            guard_s=listener.guard_s,
+            late_limit_s=listener.late_limit_s,
+            arrival_mode=listener.arrival_mode,
+        ),
+        clock=ClockRules(
+            prompt_delay_s=listener.prompt_delay_s,
+            longest_acquisition_s=listener.longest_acquisition_s,
+            largest_offset_s=listener.largest_clock_offset_s,
+            late_limit_s=listener.late_limit_s,
+        ),
+        zone=_zone(listener.scanner_time_zone),
+        sync=sync,
+        retention_s=listener.retention_days * 86400,
+    )
+
+
+def _zone(name: str) -> ZoneInfo | None:
+    if not name:
+        return None
+    try:
+        return ZoneInfo(name)
+    except (ZoneInfoNotFoundError, ValueError):
+        raise ConfigError(f"listener.scanner_time_zone: there is no zone {name!r}") from None
+
+
+def open_scp(
+    config: ListenerConfig,
+    inbox: Inbox,
+    metrics: ListenerMetrics,
+    on_stored: Callable[[Path], None],
+) -> Scp:
+    """The service, bound to its port. Raises ConfigError where port, list or key is no good."""
+    tls = None
+    if config.tls_certificate and config.tls_key and config.tls_authority:
+        try:
+            tls = tls_context(config.tls_certificate, config.tls_key, config.tls_authority)
+        except OSError as error:
+            raise ConfigError(f"listener.tls_*: certificates cannot be used ({error})") from None
+    try:
+        return Scp(scp_rules(config), inbox, metrics, on_stored, tls)
+    except ValueError as error:
+        raise ConfigError(f"listener: {error}") from None
+    except OSError as error:
+        where = f"{config.host}:{config.port}"
+        raise ConfigError(f"listener.port: cannot listen on {where} ({error.strerror})") from None
+
+
+def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]) -> None:
+    """Serve until `stop` is set. Raises ConfigError and CaseRecordError before it is ready."""
+    received: SimpleQueue[Path] = SimpleQueue()
+    metrics = ListenerMetrics()
+    with ExitStack() as stack:
+        record = stack.enter_context(CaseRecord(config.room.case_dir, create=True))
+        inbox = Inbox(
+            inbox_folder(config.room.case_dir),
+            min_free_bytes=config.listener.min_free_mib * _MIB,
+        )
+        discarded = inbox.discard_unfinished()
+        intake = Intake(record, inbox, intake_rules(config, time.time()), metrics)
+        scp = open_scp(config.listener, inbox, metrics, received.put)
+        stack.callback(scp.stop)
+        metrics.show("associations_open", "Open associations", lambda: scp.open_associations)
+        metrics.show("inbox_waiting", "Files not yet in the record", received.qsize)
+        metrics.show("disk_free_bytes", "Free disk below the inbox", inbox.free_bytes)
+        metrics_port = None
+        if config.listener.metrics_port is not None:
+            metrics_port, stop_metrics = metrics.serve(config.listener.metrics_port)
+            stack.callback(stop_metrics)
+        scp.start()
+        on_ready(Ready(scp.port, metrics_port, config.listener.ae_title))
+        if discarded:
+            intake.alarm("unfinished_files", f"{discarded} unanswered files of an earlier run")
+        left_over = intake.take_left_over()
+        log.info("serving", port=scp.port, left_over=left_over)
+        presence = stack.enter_context(Presence(config.room.case_dir, "listener"))
+        _loop(intake, scp, inbox, received, stop, presence)
+
+
+def _loop(
+    intake: Intake,
+    scp: Scp,
+    inbox: Inbox,
+    received: "SimpleQueue[Path]",
+    stop: threading.Event,
+    presence: Presence,
+) -> None:
+    housekeeping_at_s = 0.0
+    is_low = False
+    while not stop.is_set():
+        presence.beat()
+        _take_received(intake, received)
+        intake.look_at_record()
+        while scp.alarms:
+            intake.note_alarm(*scp.alarms.popleft())
+        if time.monotonic() >= housekeeping_at_s:
+            housekeeping_at_s = time.monotonic() + _HOUSEKEEPING_S
+            was_low, is_low = is_low, inbox.free_bytes() < 2 * inbox.min_free_bytes
+            if is_low and not was_low:
+                intake.alarm("disk_low", f"{inbox.free_bytes() // _MIB} MiB free")
+            intake.remove_old(time.time())
+
+
+def _take_received(intake: Intake, received: "SimpleQueue[Path]") -> None:
+    """Wait for at most one poll, then take whatever is there."""
+    try:
+        path = received.get(timeout=_POLL_S)
+        while True:
+            intake.take(path)
+            path = received.get_nowait()
+    except Empty:
+        return

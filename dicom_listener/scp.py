@@ -1,0 +1,270 @@
+"""The C-STORE and C-ECHO service: bytes from the network into the inbox, then the answer.
+
+Success is answered after the slice is durable and for no other reason. Everything else is answered
+with a failure status and a comment that says why, and leaves a log line.
+"""
+
+import ipaddress
+import os
+import ssl
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import structlog
+from pydicom.dataset import Dataset
+from pynetdicom import AE, evt
+from pynetdicom.events import Event
+
+from dicom_listener import inbox as inbox_module
+from dicom_listener.inbox import Envelope, Inbox, InboxError, sha256_of
+from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.negotiation import NegotiationReport, add_contexts, rejection_text, report_of
+from dicom_listener.peek import NoDataSetError, peek
+from dicom_listener.transport import BoundedSocket, PromptServer
+
+SUCCESS = 0x0000
+OUT_OF_RESOURCES = 0xA700
+DOES_NOT_MATCH_SOP_CLASS = 0xA900
+CANNOT_UNDERSTAND = 0xC000
+_COMMENT_CHARACTERS = 64  # Error Comment (0000,0902) is an LO
+_REPORTS_KEPT = 50
+
+log = structlog.get_logger("listener")
+
+
+@dataclass(frozen=True)
+class ScpRules:
+    """Who may talk to us, how much, and for how long they may keep silent."""
+
+    host: str = "127.0.0.1"
+    port: int = 0
+    ae_title: str = "AUTOSPINE"
+    require_called_ae_title: bool = True
+    calling_ae_titles: tuple[str, ...] = ()  # () = any
+    peer_networks: tuple[str, ...] = ()  # () = any; addresses or CIDR networks
+    any_storage_class: bool = True
+    max_associations: int = 16
+    acse_timeout_s: float = 10.0
+    dimse_timeout_s: float = 30.0
+    network_timeout_s: float = 60.0
+    max_pdu_bytes: int = 1024 * 1024
+    max_object_bytes: int = 512 * 1024 * 1024
+    negotiated_pdu_bytes: int = 256 * 1024
+
+
+class Scp:
+    """Owns the listening port. `on_stored(path)` is called after each answerable slice."""
+
+    def __init__(
+        self,
+        rules: ScpRules,
+        inbox: Inbox,
+        metrics: ListenerMetrics,
+        on_stored: Callable[[Path], None],
+        tls: ssl.SSLContext | None = None,
+    ) -> None:
+        self._rules = rules
+        self._inbox = inbox
+        self._metrics = metrics
+        self._on_stored = on_stored
+        self._networks = [ipaddress.ip_network(net, strict=False) for net in rules.peer_networks]
+        self.reports: deque[NegotiationReport] = deque(maxlen=_REPORTS_KEPT)
+        self.alarms: deque[tuple[str, str]] = deque(maxlen=1000)
+        self._ae = self._application_entity()
+        self._server: PromptServer = self._ae.make_server(
+            (rules.host, rules.port),
+            ssl_context=tls,
+            evt_handlers=[
+                (evt.EVT_REQUESTED, self._on_requested),
+                (evt.EVT_ACCEPTED, self._on_accepted),
+                (evt.EVT_REJECTED, self._on_rejected),
+                (evt.EVT_C_ECHO, self._on_echo),
+                (evt.EVT_C_STORE, self._on_store),
+            ],
+            server_class=self._server_class(),
+        )
+        self._thread = threading.Thread(
+            target=self._server.serve_forever, kwargs={"poll_interval": 0.1}, name="listen"
+        )
+
+    @property
+    def port(self) -> int:
+        return int(self._server.server_address[1])
+
+    def start(self) -> None:
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Stop listening and end every association; idempotent."""
+        if self._thread.is_alive():
+            self._server.shutdown()
+            self._thread.join()
+        for association in self._server.active_associations:
+            association.abort()
+
+    @property
+    def open_associations(self) -> int:
+        return len(self._server.active_associations)
+
+    def _application_entity(self) -> AE:
+        rules = self._rules
+        ae = AE(rules.ae_title)
+        ae.implementation_class_uid = inbox_module.IMPLEMENTATION_CLASS_UID
+        ae.implementation_version_name = inbox_module.IMPLEMENTATION_VERSION_NAME
+        ae.maximum_associations = rules.max_associations
+        ae.acse_timeout = rules.acse_timeout_s
+        ae.dimse_timeout = rules.dimse_timeout_s
+        ae.network_timeout = rules.network_timeout_s
+        ae.maximum_pdu_size = rules.negotiated_pdu_bytes
+        add_contexts(ae, any_storage_class=rules.any_storage_class)
+        return ae
+
+    def _server_class(self) -> type[PromptServer]:
+        """The server with this room's limits: pynetdicom makes the instance itself."""
+        rules = self._rules
+        bounds = {
+            "max_pdu_bytes": rules.max_pdu_bytes,
+            # one over the limit is still read to its end, so that it can be answered
+            "max_message_bytes": 2 * rules.max_object_bytes,
+            "pdu_deadline_s": rules.network_timeout_s,
+            "on_refused": staticmethod(lambda why: self._alarm("oversize", why)),
+        }
+        settings = {
+            "socket_class": type("RoomSocket", (BoundedSocket,), bounds),
+            "network_timeout_s": rules.network_timeout_s,
+            "first_byte_timeout_s": rules.acse_timeout_s,
+            "most_unopened": 4 * rules.max_associations,
+            "on_dropped": staticmethod(self._on_dropped),
+        }
+        return type("RoomServer", (PromptServer,), settings)
+
+    # Associations
+
+    def _on_dropped(self, peer: str, why: str) -> None:
+        self._metrics.dropped.inc()
+        log.debug("connection dropped", peer=peer, why=why)
+
+    def _on_requested(self, event: Event) -> None:
+        refusal = self._why_refused(event.assoc)
+        if refusal is None:
+            return
+        code, why = refusal
+        event.assoc.acse.send_reject(*code)
+        self._reject(report_of(event.assoc, why))
+        event.assoc.kill()
+
+    def _why_refused(self, association: Any) -> tuple[tuple[int, int, int], str] | None:
+        request = association.requestor.primitive
+        calling, called = request.calling_ae_title.strip(), request.called_ae_title.strip()
+        if self._rules.require_called_ae_title and called != self._rules.ae_title.strip():
+            return (1, 1, 7), f"called AE title {called!r} is not ours ({self._rules.ae_title})"
+        if self._rules.calling_ae_titles and calling not in self._rules.calling_ae_titles:
+            return (1, 1, 3), f"calling AE title {calling!r} is not on the list"
+        address = ipaddress.ip_address(association.requestor.address)
+        if self._networks and not any(address in network for network in self._networks):
+            return (1, 1, 1), f"address {address} is not on the list"
+        return None
+
+    def _on_accepted(self, event: Event) -> None:
+        report = report_of(event.assoc)
+        self._metrics.associations.labels("accepted").inc()
+        self.reports.append(report)
+        if report.anything_refused:
+            log.warning("presentation contexts refused", report=str(report))
+        event.assoc.dul.socket.message_done()
+
+    def _on_rejected(self, event: Event) -> None:
+        code = event.assoc.acceptor.primitive
+        why = rejection_text(code.result, code.result_source, code.diagnostic)
+        self._reject(report_of(event.assoc, why))
+
+    def _reject(self, report: NegotiationReport) -> None:
+        self._metrics.associations.labels("rejected").inc()
+        self.reports.append(report)
+        self._alarm("association_rejected", str(report).replace("\n", "; "))
+
+    # Messages
+
+    def _on_echo(self, event: Event) -> int:
+        self._metrics.echoes.inc()
+        event.assoc.dul.socket.message_done()
+        return SUCCESS
+
+    def _on_store(self, event: Event) -> Dataset | int:
+        began_s = event.assoc.dul.socket.message_done()
+        try:
+            status, comment = self._store(event)
+        except Exception as error:  # the sender must get an answer, whatever went wrong
+            log.exception("store failed")
+            status, comment = CANNOT_UNDERSTAND, f"internal error: {type(error).__name__}"
+        if status == SUCCESS:
+            if began_s is not None:
+                self._metrics.store_seconds.observe(time.monotonic() - began_s)
+            return SUCCESS
+        self._metrics.refused.labels(f"{status:04X}").inc()
+        self._alarm("slice_refused", f"0x{status:04X}: {comment}")
+        return _failure(status, comment)
+
+    def _store(self, event: Event) -> tuple[int, str]:
+        received_s, received_monotonic_s = time.time(), time.monotonic()
+        data_set = event.encoded_dataset(include_meta=False)
+        if len(data_set) > self._rules.max_object_bytes:
+            limit_mib = self._rules.max_object_bytes // 2**20
+            return OUT_OF_RESOURCES, f"object over the limit of {limit_mib} MiB"
+        request, association = event.request, event.assoc
+        sop_class = str(request.AffectedSOPClassUID or "")
+        transfer_syntax = str(event.context.transfer_syntax)
+        try:
+            peeked = peek(data_set, transfer_syntax)
+        except NoDataSetError as error:
+            return CANNOT_UNDERSTAND, str(error)
+        if peeked.sop_class_uid and peeked.sop_class_uid != sop_class:
+            return DOES_NOT_MATCH_SOP_CLASS, "the data set is of another SOP class"
+        envelope = Envelope(
+            calling_ae_title=str(association.requestor.ae_title).strip(),
+            called_ae_title=str(association.acceptor.ae_title).strip(),
+            peer_address=str(association.requestor.address),
+            peer_port=int(association.requestor.port),
+            received_s=received_s,
+            received_monotonic_s=received_monotonic_s,
+            transfer_syntax_uid=transfer_syntax,
+            sop_class_uid=sop_class,
+            sop_instance_uid=str(request.AffectedSOPInstanceUID or ""),
+            sha256=sha256_of(data_set),
+            size_bytes=len(data_set),
+        )
+        try:
+            path = self._inbox.store(data_set, envelope)
+        except InboxError as error:
+            return OUT_OF_RESOURCES, str(error)
+        self._metrics.stored.inc()
+        self._metrics.stored_bytes.inc(len(data_set))
+        self._on_stored(path)
+        return SUCCESS, ""
+
+    def _alarm(self, kind: str, text: str) -> None:
+        self._metrics.alarms.labels(kind).inc()
+        self.alarms.append((kind, text))
+        log.warning(kind, text=text)
+
+
+def _failure(status: int, comment: str) -> Dataset:
+    answer = Dataset()
+    answer.Status = status
+    answer.ErrorComment = comment.encode("ascii", "replace").decode()[:_COMMENT_CHARACTERS]
+    return answer
+
+
+def tls_context(certificate: Path, key: Path, authority: Path) -> ssl.SSLContext:
+    """Mutual TLS: we show `certificate`, the peer must show one signed by `authority`."""
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.minimum_version = ssl.TLSVersion.TLSv1_2
+    context.load_cert_chain(os.fspath(certificate), os.fspath(key))
+    context.load_verify_locations(cafile=os.fspath(authority))
+    context.verify_mode = ssl.CERT_REQUIRED
+    return context

@@ -1,0 +1,179 @@
+"""TCP under the association: answers at once, waits for nobody for ever.
+
+Senders write the head and the body of a message as two segments; with Nagle's algorithm on their
+side and delayed acknowledgement on ours, every message would stall for 40 ms. So what arrives is
+acknowledged at once (TCP_QUICKACK, which the kernel forgets after every receive).
+
+A health check that connects and goes, a peer that says nothing, half a PDU, a TLS handshake that
+never ends: each holds one thread for a bounded time, and their number is bounded too.
+"""
+
+import selectors
+import socket
+import ssl
+import threading
+import time
+from collections.abc import Callable
+from socketserver import TCPServer
+from typing import Any
+
+from pynetdicom.association import Association
+from pynetdicom.transport import AssociationSocket, RequestHandler, ThreadedAssociationServer
+
+_QUICKACK = getattr(socket, "TCP_QUICKACK", None)
+_CHUNK_BYTES = 256 * 1024
+_ASSOCIATE_RQ = 0x01
+
+
+def acknowledge_at_once(sock: socket.socket) -> None:
+    """Where the option does not exist (not Linux) it is simply not set."""
+    if _QUICKACK is not None:
+        sock.setsockopt(socket.IPPROTO_TCP, _QUICKACK, 1)
+
+
+class BoundedSocket(AssociationSocket):
+    """pynetdicom's socket with large reads, prompt acknowledgement, and limits.
+
+    A PDU or a message over its limit, or a PDU that takes too long, ends the connection.
+    """
+
+    max_pdu_bytes = 2**20
+    max_message_bytes = 2**30
+    pdu_deadline_s = 60.0
+    on_refused: Callable[[str], None] = staticmethod(lambda why: None)
+
+    def __init__(self, assoc: Association, client_socket: socket.socket) -> None:
+        super().__init__(assoc, client_socket=client_socket)
+        self.message_bytes = 0
+        self.message_began_s: float | None = None
+
+    def message_done(self) -> float | None:
+        """Start counting anew; return the monotonic instant of the message's first byte."""
+        began_s, self.message_began_s = self.message_began_s, None
+        self.message_bytes = 0
+        return began_s
+
+    def recv(self, nr_bytes: int) -> bytearray:
+        sock = self.socket
+        if sock is None:
+            raise OSError("the connection is closed")
+        if self.message_began_s is None:
+            self.message_began_s = time.monotonic()
+        self._check_size(nr_bytes)
+        received = bytearray()
+        deadline_s = time.monotonic() + self.pdu_deadline_s
+        while len(received) < nr_bytes:
+            piece = sock.recv(min(_CHUNK_BYTES, nr_bytes - len(received)))
+            if not piece:
+                break
+            acknowledge_at_once(sock)
+            received += piece
+            if len(received) < nr_bytes and time.monotonic() > deadline_s:
+                self._refuse(f"a PDU took longer than {self.pdu_deadline_s:g} s")
+        return received
+
+    def _check_size(self, nr_bytes: int) -> None:
+        self.message_bytes += nr_bytes
+        if nr_bytes > self.max_pdu_bytes:
+            self._refuse(f"a PDU of {nr_bytes} bytes, {self.max_pdu_bytes} are allowed")
+        if self.message_bytes > self.max_message_bytes:
+            self._refuse(f"a message of more than {self.max_message_bytes} bytes")
+
+    def _refuse(self, why: str) -> None:
+        self.on_refused(why)
+        raise OSError(why)
+
+
+class PromptRequestHandler(RequestHandler):
+    server: "PromptServer"
+
+    def _create_association(self) -> Association:
+        association = super()._create_association()
+        # The plain socket has announced the connection (Evt5); ours announces it itself.
+        association.dul.event_queue.get_nowait()
+        bounded = self.server.socket_class(association, self.request)
+        association.dul.socket = bounded
+        return association
+
+
+class PromptServer(ThreadedAssociationServer):
+    """Accepts, prepares each connection in a thread of its own, then hands it to pynetdicom."""
+
+    daemon_threads = True
+    block_on_close = False
+    request_queue_size = 128
+    socket_class: type[BoundedSocket] = BoundedSocket
+    network_timeout_s = 60.0
+    first_byte_timeout_s = 10.0
+    most_unopened = 64
+    on_dropped: Callable[[str, str], None] = staticmethod(lambda peer, why: None)
+
+    def __init__(self, *args: Any, **kwargs: Any) -> None:
+        self._unopened = threading.BoundedSemaphore(self.most_unopened)
+        kwargs["request_handler"] = PromptRequestHandler
+        super().__init__(*args, **kwargs)
+
+    def get_request(self) -> tuple[socket.socket, Any]:
+        # No TLS here: a handshake in this thread would let one silent peer stop everyone.
+        assert self.socket is not None
+        return self.socket.accept()
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        if not self._unopened.acquire(blocking=False):
+            self.on_dropped(client_address[0], "too many connections that say nothing")
+            self.shutdown_request(request)
+            return
+        super().process_request(request, client_address)
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            opened = self._open(request, client_address[0])
+        finally:
+            self._unopened.release()
+        if opened is not None:
+            super().process_request_thread(opened, client_address)
+
+    def _open(self, request: socket.socket, peer: str) -> socket.socket | None:
+        """The connection, ready for its first PDU; None where there will be none."""
+        sock = request
+        try:
+            sock.settimeout(self.first_byte_timeout_s)
+            sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            sock.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
+            acknowledge_at_once(sock)
+            if self.ssl_context is not None:
+                sock = self.ssl_context.wrap_socket(sock, server_side=True)
+                _wait_readable(sock, self.first_byte_timeout_s)
+            else:
+                first = sock.recv(1, socket.MSG_PEEK)
+                if not first:
+                    self.on_dropped(peer, "closed without a word")
+                    self.shutdown_request(request)
+                    return None
+                if first[0] != _ASSOCIATE_RQ:
+                    self.on_dropped(peer, f"not DICOM: first byte 0x{first[0]:02X}")
+                    self.shutdown_request(request)
+                    return None
+            sock.settimeout(self.network_timeout_s)
+        except OSError as error:  # TLS errors and timeouts are OSErrors too
+            self.on_dropped(peer, f"{type(error).__name__}: {error}")
+            self.shutdown_request(sock)
+            return None
+        return sock
+
+    def shutdown(self) -> None:
+        """Stop listening. (pynetdicom's own would look for us in a list that it did not fill.)"""
+        TCPServer.shutdown(self)
+        self.server_close()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        self.on_dropped(client_address[0], "failed to start an association")
+
+
+def _wait_readable(sock: socket.socket, timeout_s: float) -> None:
+    if isinstance(sock, ssl.SSLSocket) and sock.pending():
+        return
+    with selectors.DefaultSelector() as selector:
+        selector.register(sock, selectors.EVENT_READ)
+        if not selector.select(timeout_s):
+            raise TimeoutError("no association request")

@@ -1,0 +1,79 @@
+"""What the bridge asks of motors: the seam between the daemon and a driver.
+
+Positions are absolute integer micrometres by axis name. Every call is bounded in time, bus faults
+included: `poll` returns within POLL_BOUND_S and `stop` within STOP_BOUND_S, because the loop that
+calls them also listens for STOP.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Protocol
+
+POLL_BOUND_S = 0.05
+STOP_BOUND_S = 0.3
+
+
+class MotorError(Exception):
+    """The motors could not do it; `code` is a short word, `text` names axis, number and unit."""
+
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(f"{code}: {text}")
+        self.code = code
+        self.text = text
+
+
+@dataclass(frozen=True)
+class MotorStatus:
+    """What the motors said last.
+
+    moving: a motion begun by `move_to` or `home` has not ended (legs of one motion count as one).
+    reached: the last motion ended at its setpoints within the driver's tolerance.
+    readback_um: by axis; for an open-loop axis the position that the step count implies.
+    certain: false from power-up, controller reset, stall or an unexpected motion until `home` or
+        `declare_position`.
+    fault: a short code while something is wrong (a fault ends the motion), else None.
+    """
+
+    moving: bool
+    reached: bool
+    readback_um: Mapping[str, int]
+    certain: bool
+    parked: bool = False
+    fault: str | None = None
+    fault_text: str = ""
+    warnings: tuple[str, ...] = field(default=())
+
+
+class Motors(Protocol):
+    def open(self) -> MotorStatus:
+        """Connect, identify and initialise the controllers; nothing moves. Raises MotorError."""
+
+    def move_to(self, setpoints_um: Mapping[str, int]) -> None:
+        """Begin one motion of the named axes to absolute setpoints (unparks if needed).
+
+        Raises MotorError, and then nothing moves. Never called while `poll` says moving.
+        """
+
+    def home(self) -> None:
+        """Begin the search for the reference; progress by `poll`. Raises MotorError."""
+
+    def poll(self) -> MotorStatus:
+        """Advance and read. Called about every 20 ms during a motion, every 200 ms otherwise.
+
+        Faults are reported in the status, never raised.
+        """
+
+    def stop(self) -> None:
+        """Stop all axes now. Idempotent, allowed at any time, also before `open` and after errors.
+
+        Raises MotorError when a controller did not confirm; the stop bytes were sent to all.
+        """
+
+    def park(self) -> None:
+        """Take the power off; the motors hold by friction. Progress by `poll`: `parked`."""
+
+    def declare_position(self, positions_um: Mapping[str, int]) -> None:
+        """The axes stand at these positions (measured otherwise). Raises MotorError."""
+
+    def close(self) -> None:
+        """Release the ports. Idempotent; stops nothing by itself."""

@@ -1,0 +1,347 @@
+"""What the operator (or a program with the operator's rights) may ask of the control loop.
+
+Every method runs in the control loop's thread. What cannot be done now is a `ConflictError` whose
+text says what to do instead; every command that is carried out is an event that names who asked.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+from case_record.record import CaseRecord
+from dicom_listener.intake import reassign
+from robot_bridge.client import BridgeError, BridgeStatus
+from room_config.load import Config
+from service.approach import CONFIRM, ApproachArguments
+from service.calibration import Calibration, CalibrationArguments
+from service.estimate import MotionNoise
+from service.execution import Execution
+from service.plan import PlanRefusedError, Travel, check_travel
+from service.procedures import (
+    APPROACH,
+    CALIBRATION,
+    JOG,
+    approach_arguments,
+    calibration_arguments,
+    latest_calibration,
+)
+from service.room_link import RoomLink
+from sr_engine.shiftset import named, paper_random
+
+_SOURCE = "service"
+# what a restart of the robot may have moved it by, per axis, before it is seen again
+_UNSEEN_MOVE_MM = 5.0
+
+
+class ConflictError(Exception):
+    """Not now; the text says why and what to do. `code` is for programs."""
+
+    def __init__(self, code: str, text: str) -> None:
+        super().__init__(text)
+        self.code = code
+
+
+class Commands:
+    def __init__(
+        self, config: Config, record: CaseRecord, link: RoomLink, execution: Execution
+    ) -> None:
+        self._config = config
+        self._record = record
+        self._link = link
+        self._execution = execution
+
+    # Robot
+
+    def reset(self, by: str) -> None:
+        """Clear a latched stop, take the positions as they stand, and arm."""
+        status = self._linked()
+        try:
+            if not status.position_certain:
+                self._link.client.declare_position(status.positions_um, by)
+                self._note("position_declared", by, {"positions_um": dict(status.positions_um)})
+            if status.stopped:
+                self._link.client.rearm(by)
+            elif not status.armed:
+                self._link.client.arm(by)
+        except BridgeError as error:
+            raise ConflictError("robot_refused", str(error)) from error
+        self._note("armed", by, {})
+
+    def note_stop(self, by: str, emergency: bool) -> None:
+        """STOP was sent already: record it and end the procedure."""
+        self._note("emergency" if emergency else "stop", by, {})
+        self._abort(f"STOP by {by}")
+
+    def abort(self, by: str) -> None:
+        """End the running procedure; the robot stays where it is."""
+        if self._record.running_procedure() is None:
+            raise ConflictError("nothing_runs", "No procedure is running.")
+        self._note("abort", by, {})
+        self._abort(f"ended by {by}")
+
+    def _abort(self, reason: str) -> None:
+        if self._record.running_procedure() is not None:
+            self._execution.abort(reason)
+
+    def keep_lock(self) -> None:
+        """Hold the insertion lock from READY until the operator says that the needle is out."""
+        status = self._link.status
+        if status is None or status.insertion_locked or status.moving:
+            return
+        if ready_arrival(self._record) is None:
+            return
+        try:
+            self._link.client.set_insertion_lock(True, _SOURCE)
+        except BridgeError:
+            return  # asked again at the next tick; until then `may_start` refuses every motion
+        self._note("insertion_locked", _SOURCE, {})
+
+    # Procedures
+
+    def start_calibration(self, by: str) -> int:
+        """Begin a calibration; returns its procedure id."""
+        self._may_start()
+        service = self._config.service
+        travel = self._travel()
+        origin_um = {axis: (t.min_um + t.max_um) // 2 for axis, t in travel.items()}
+        move_um = round(service.calibration_move_mm * 1000)
+        first, second = service.axes
+        for axis in (first, second):
+            if axis not in travel:
+                raise ConflictError("unknown_axis", f"The robot has no axis {axis!r}.")
+            try:
+                check_travel({axis: origin_um[axis] + move_um}, travel)
+            except PlanRefusedError as error:
+                raise ConflictError("out_of_travel", f"Calibration: {error}.") from error
+        arguments = CalibrationArguments(
+            axes=(first, second),
+            origin_um=origin_um,
+            move_um=move_um,
+            shifts_px=self._shifts_px(),
+            position_gate_mm=self._config.imaging.position_gate_mm,
+            gate_sigma=service.prediction_gate_sigma,
+            repeatability_mm=service.repeatability_um / 1000,
+            scale_error=service.step_scale_error,
+        )
+        return self._begin(CALIBRATION, calibration_arguments(arguments), by)
+
+    def set_target(self, patient_mm: Sequence[float], by: str) -> None:
+        """Set where the fiducial is to be, in patient mm (LPS)."""
+        if len(patient_mm) != 3 or not all(math.isfinite(value) for value in patient_mm):
+            raise ConflictError("bad_target", "A target is three finite numbers, patient mm.")
+        if self._record.running_procedure() is not None:
+            raise ConflictError("busy", "Abort the running procedure before changing the target.")
+        self._note("target_set", by, {"patient_mm": [float(value) for value in patient_mm]})
+
+    def set_entry(self, patient_mm: Sequence[float], by: str) -> None:
+        """Set the planned skin point, patient mm (LPS)."""
+        self._note("entry_set", by, {"patient_mm": [float(value) for value in patient_mm]})
+
+    def jog(self, axis: str, distance_um: int, by: str) -> int:
+        """Move one axis by hand; returns the id of the procedure that does it."""
+        self._may_start()
+        status = self._linked()
+        travel = self._travel()
+        if axis not in travel or axis not in status.positions_um:
+            raise ConflictError("unknown_axis", f"The robot has no axis {axis!r}.")
+        if not status.position_certain:
+            raise ConflictError("position_uncertain", "Check the robot's position and re-arm.")
+        setpoint_um = status.positions_um[axis] + distance_um
+        try:
+            check_travel({axis: setpoint_um}, travel)
+        except PlanRefusedError as error:
+            raise ConflictError("out_of_travel", f"Not moved: {error}.") from error
+        setpoints_um = {**status.positions_um, axis: setpoint_um}
+        return self._begin(JOG, {"setpoints_um": setpoints_um}, by)
+
+    def start_approach(self, by: str) -> int:
+        """Begin the approach to the target; returns its procedure id."""
+        self._may_start()
+        start = self._start_point()
+        target = self._record.last_event("target_set")
+        if target is None:
+            raise ConflictError("no_target", "Set a target first.")
+        row, col = start.plane.from_patient(target.body["patient_mm"]).tolist()
+        service = self._config.service
+        arguments = ApproachArguments(
+            target_mm=(row, col),
+            travel_um=self._link.travel_um,
+            tolerance_mm=service.tolerance_mm,
+            confidence=service.confidence,
+            max_iterations=service.max_iterations,
+            confirm_moves=service.confirm_moves,
+            position_gate_mm=self._config.imaging.position_gate_mm,
+            gate_sigma=service.prediction_gate_sigma,
+            repeatability_mm=service.repeatability_um / 1000,
+            scale_error=service.step_scale_error,
+            strategy=service.strategy,
+            seed=self._seed(),
+        )
+        return self._begin(APPROACH, approach_arguments(arguments, start), by)
+
+    def answer(self, question_id: str, choice: str, by: str, plan_id: str | None = None) -> None:
+        """Answer the question that is on the page; void if it is another one by now.
+
+        A confirmed plan must also still rest on where the robot stands and on the newest
+        measurement.
+        """
+        question = self._execution.question
+        if question is None or question.question_id != question_id:
+            raise ConflictError("stale_question", "This question is not open any more.")
+        if choice not in question.choices:
+            raise ConflictError("unknown_choice", f"Choose one of {', '.join(question.choices)}.")
+        if choice == CONFIRM and question.plan is not None:
+            self._check_plan(question.plan, plan_id)
+        body = {"question_id": question_id, "choice": choice}
+        self._note("answered", by, body if plan_id is None else {**body, "plan_id": plan_id})
+        self._execution.answer(choice, by)
+
+    def _check_plan(self, plan: Mapping[str, Any], plan_id: str | None) -> None:
+        status = self._linked()
+        if plan_id is not None and plan_id != plan["plan_id"]:
+            raise ConflictError("stale_plan", "This plan was replaced: read the one shown now.")
+        if status.stopped or not status.armed:
+            raise ConflictError("not_armed", "Re-arm the robot; then start the approach again.")
+        newest = self._record.last_measurement()
+        if newest is not None and newest.measurement_id != plan["measurement_id"]:
+            raise ConflictError("stale_plan", "A newer measurement exists: start again.")
+        for axis, planned_from_um in plan["from_um"].items():
+            moved_um = status.positions_um.get(axis, planned_from_um) - planned_from_um
+            if not abs(moved_um) <= self._config.service.repeatability_um:
+                raise ConflictError(
+                    "stale_plan",
+                    f"Axis {axis} has moved by {moved_um} µm since this plan was made: "
+                    "end the procedure and start the approach again.",
+                )
+
+    # Slices and the case
+
+    def assign_slice(self, slice_id: int, hold_id: int | None, why: str, by: str) -> None:
+        """Overrule the listener: the slice belongs to this hold, or (None) to none."""
+        row = self._record.slice(slice_id)
+        if hold_id is not None:
+            self._record.hold(hold_id)
+            if not row.header.get("geometry"):
+                raise ConflictError("no_geometry", f"Slice {slice_id} has no geometry: rescan.")
+        reassign(self._record, slice_id, hold_id, by, why or "decided on the page")
+
+    def confirm_acquisition(self, hold_id: int, by: str) -> None:
+        """The operator says that the slices of a hold were acquired (rooms in arrival mode)."""
+        self._record.hold(hold_id)
+        self._note("acquisition_confirmed", by, {"hold_id": hold_id})
+
+    def describe_case(self, by: str, **words: str) -> None:
+        """Write down what the operator says about the case."""
+        self._note("case_described", by, dict(words))
+
+    # The puncture
+
+    def puncture(self, by: str, insertion_depth_mm: float | None = None) -> None:
+        """Record that the puncture was made. Motion stays locked until the needle is out."""
+        arrival = ready_arrival(self._record)
+        if arrival is None:
+            raise ConflictError("not_ready", "The needle guide is not at a target (not READY).")
+        body = {
+            "procedure_id": arrival[0],
+            "insertion_depth_mm": insertion_depth_mm,
+            "error_mm": arrival[1]["error_mm"],
+            "sigma_mm": arrival[1]["sigma_mm"],
+        }
+        self._note("puncture", by, body)
+
+    def needle_out(self, by: str) -> None:
+        """The needle is out: unlock motion."""
+        status = self._linked()
+        self._note("needle_out", by, {})
+        if not status.insertion_locked:
+            return
+        try:
+            self._link.client.set_insertion_lock(False, by)
+        except BridgeError as error:
+            raise ConflictError("robot_refused", str(error)) from error
+
+    # What these have in common
+
+    def _begin(self, name: str, arguments: dict[str, Any], by: str) -> int:
+        with self._record.transaction():
+            number = self._record.begin_procedure(name, arguments)
+            self._note(f"{name}_started", by, {"procedure_id": number})
+        return number
+
+    def _note(self, kind: str, by: str, body: dict[str, Any]) -> None:
+        self._record.append_event(kind, body, source=_SOURCE, who=by)
+
+    def _linked(self) -> BridgeStatus:
+        status = self._link.status
+        if status is None:
+            raise ConflictError("no_link", f"No link to the robot: {self._link.problem}")
+        return status
+
+    def _may_start(self) -> None:
+        self._linked()
+        refusal = may_start(self._record, self._link.status)
+        if refusal is not None:
+            raise refusal
+
+    def _shifts_px(self) -> tuple[tuple[float, float], ...]:
+        name = self._config.service.shift_set
+        if name != "paper":
+            return named(name).shifts_px
+        return paper_random(np.random.default_rng(self._seed())).shifts_px
+
+    def _seed(self) -> int:
+        """Of the next procedure's random choices: from the case's seed and its number."""
+        case = self._record.case()
+        words = (case.seed if case else 0, len(self._record.procedures()))
+        return int(np.random.SeedSequence(words).generate_state(1)[0])
+
+    def _travel(self) -> dict[str, Travel]:
+        return {axis: Travel(low, high) for axis, (low, high) in self._link.travel_um.items()}
+
+    def _start_point(self) -> Calibration:
+        """The calibration with the estimate carried to where the robot stands now."""
+        calibration = latest_calibration(self._record)
+        if calibration is None:
+            raise ConflictError("not_calibrated", "Calibrate first.")
+        status = self._linked()
+        estimate = calibration.estimate
+        if dict(estimate.setpoints_um) == dict(status.positions_um):
+            return calibration
+        service = self._config.service
+        noise = MotionNoise(service.repeatability_um / 1000, service.step_scale_error)
+        moved = estimate.moved_to(dict(status.positions_um), calibration.jacobian, noise)
+        unseen = np.eye(2) * _UNSEEN_MOVE_MM**2
+        return replace(
+            calibration, estimate=replace(moved, covariance_mm2=moved.covariance_mm2 + unseen)
+        )
+
+
+def may_start(record: CaseRecord, status: BridgeStatus | None) -> ConflictError | None:
+    """Why the robot may not begin to move now, or None."""
+    if status is None:
+        return ConflictError("no_link", "No link to the robot.")
+    if record.running_procedure() is not None:
+        return ConflictError("busy", "A procedure is running: wait for its end or abort it.")
+    if ready_arrival(record) is not None or status.insertion_locked:
+        return ConflictError("insertion_locked", "Motion is locked until the needle is out.")
+    if status.stopped or not status.armed:
+        return ConflictError("not_armed", "Re-arm the robot first.")
+    return None
+
+
+def ready_arrival(record: CaseRecord) -> tuple[int, dict[str, Any]] | None:
+    """The approach (id and result) whose target the needle guide is at, until the needle is out."""
+    arrival = record.last_procedure(APPROACH, "done")
+    if arrival is None or arrival.result is None or arrival.ended_s is None:
+        return None
+    if record.running_procedure() is not None:
+        return None
+    out = record.last_event("needle_out")
+    if out is not None and out.wall_s > arrival.ended_s:
+        return None
+    return arrival.procedure_id, dict(arrival.result)

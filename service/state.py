@@ -1,0 +1,202 @@
+"""What the room is doing now, in one value: the page and the virtual scanner read it."""
+
+from __future__ import annotations
+
+import time
+import uuid
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+from room_config.load import Config
+
+
+class _Frozen(BaseModel):
+    model_config = ConfigDict(frozen=True)
+
+
+class RobotState(_Frozen):
+    """The bridge as it last said it was; `linked` False: what follows is old."""
+
+    linked: bool = False
+    problem: str = "not connected yet"
+    phase: str = "START_UP"
+    armed: bool = False
+    stopped: bool = False
+    stop_reason: str = ""
+    insertion_locked: bool = False
+    moving: bool = False
+    position_certain: bool = False
+    positions_um: dict[str, int] = {}
+    travel_um: dict[str, tuple[int, int]] = {}
+    fault: str | None = None
+    boot_id: str = ""
+
+
+class AcquisitionState(_Frozen):
+    """What the scanner operator is asked to acquire now."""
+
+    request_id: str
+    hold_id: int
+    count: int
+
+
+class QuestionState(_Frozen):
+    question_id: str
+    question: str
+    choices: list[str]
+    plan: dict[str, Any] | None
+
+
+class MeasurementState(_Frozen):
+    """The newest finished measurement: positions in the slice and in the patient."""
+
+    measurement_id: int
+    method: str
+    state: str
+    finished_s: float | None
+    reason: str = ""
+    slice_id: int | None = None
+    centre_px: tuple[float, float] | None = None
+    sigma_px: tuple[float, float] | None = None
+    radius_px: float | None = None
+    radius_mm: float | None = None
+    covariance_mm2: tuple[tuple[float, float], tuple[float, float]] | None = None
+    patient_mm: tuple[float, float, float] | None = None
+    n_frames: int = 0
+    snr: float | None = None
+    has_reconstruction: bool = False
+
+
+class ErrorState(_Frozen):
+    """How far the fiducial is from the target, in the image plane (row, col) mm."""
+
+    row_mm: float
+    col_mm: float
+    error_mm: float
+    sigma_mm: float
+    probability_within_tolerance: float
+    target_px: tuple[float, float] | None = None
+
+
+class ArrivalState(_Frozen):
+    """READY: how the needle guide came to the target, and how sure that is."""
+
+    procedure_id: int
+    measurement_id: int
+    error_mm: float
+    sigma_mm: float
+    probability: float
+    iterations: int
+    frames: int
+    scan_s: float
+
+
+class SliceState(_Frozen):
+    """The slice to show, and where its pixels are in the patient (LPS mm)."""
+
+    slice_id: int
+    state: str
+    received_s: float
+    acquired_to_s: float | None = None
+    time_source: str = ""
+    shape: tuple[int, int]
+    position_mm: tuple[float, float, float]
+    row_direction: tuple[float, float, float]
+    col_direction: tuple[float, float, float]
+    spacing_mm: tuple[float, float]
+
+
+class ReconstructionState(_Frozen):
+    """The newest super-resolution image and its geometry."""
+
+    measurement_id: int
+    factor: int
+    shape: tuple[int, int]
+    position_mm: tuple[float, float, float]
+    row_direction: tuple[float, float, float]
+    col_direction: tuple[float, float, float]
+    spacing_mm: tuple[float, float]
+
+
+class HoldState(_Frozen):
+    """Where the robot stands settled; None in the state while nothing stands."""
+
+    hold_id: int
+    set_id: int
+    settled_at_s: float
+
+
+class CaseState(_Frozen):
+    """What the operator wrote down about the case."""
+
+    label: str = ""
+    operator: str = ""
+    note: str = ""
+
+
+class ProcessState(_Frozen):
+    """One of the room's processes: `up`, `old` (hangs or is quiet), `down`, `none` (not seen)."""
+
+    name: str
+    condition: str
+    detail: str = ""
+
+
+class AlarmState(_Frozen):
+    """Something that needs the operator. severity: `alarm` or `warning`."""
+
+    code: str
+    severity: str
+    text: str
+    what_to_do: str
+    since_s: float
+
+
+class RoomState(_Frozen):
+    """Everything that a screen needs to show what is going on."""
+
+    revision: int
+    at_s: float
+    room: str
+    virtual: bool
+    case_uid: str = ""
+    procedure: str | None = None
+    procedure_id: int | None = None
+    last_outcome: str = ""
+    prompt: str = ""
+    ready: bool = False
+    arrival: ArrivalState | None = None
+    robot: RobotState = RobotState()
+    acquisition_request: AcquisitionState | None = None
+    question: QuestionState | None = None
+    last_slice_id: int | None = None
+    last_slice_received_s: float | None = None
+    slices: dict[str, int] = {}
+    measurement: MeasurementState | None = None
+    calibrated: bool = False
+    target_patient_mm: tuple[float, float, float] | None = None
+    error: ErrorState | None = None
+    tolerance_mm: float
+    event_id: int = 0
+    service_id: str = ""
+    case: CaseState | None = None
+    slice: SliceState | None = None
+    reconstruction: ReconstructionState | None = None
+    hold: HoldState | None = None
+    entry_patient_mm: tuple[float, float, float] | None = None
+    punctured: bool = False
+    jog_possible: bool = False
+    processes: list[ProcessState] = []
+    alarms: list[AlarmState] = []
+
+    @classmethod
+    def initial(cls, config: Config) -> RoomState:
+        return cls(
+            revision=0,
+            at_s=time.time(),
+            service_id=uuid.uuid4().hex,
+            room=config.room.name,
+            virtual=config.room.virtual,
+            tolerance_mm=config.service.tolerance_mm,
+        )

@@ -1,0 +1,213 @@
+"""The unattended operator of the demo: reads the state as a person reads the page, and acts.
+
+It knows nothing but what the API says, so it goes on by itself after a restart in the middle of a
+case. What it writes down (one line a puncture) is compared with the truth of the virtual room.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+
+from simulator.config import VirtualRoom
+from simulator.scene import true_fiducial_mm
+from simulator.truth_client import TruthAddress, ask_where
+
+WHO = "virtual operator"
+_POLL_S = 0.05
+_PATIENCE_S = 90.0
+_MOST_FAILURES = 4
+_TARGET_REACH_MM = 7.0
+
+
+class DemoFailedError(Exception):
+    """The room could not do its job; the text says why."""
+
+    exit_code = 3
+
+
+@dataclass(frozen=True)
+class PunctureResult:
+    """One puncture: what the room believed, and what was true."""
+
+    procedure_id: int
+    true_error_mm: float
+    estimated_error_mm: float
+    sigma_mm: float
+    iterations: int
+    frames: int
+    scan_s: float
+
+    def public(self) -> dict[str, Any]:
+        """The keys that `demo --json` promises."""
+        return {key: value for key, value in asdict(self).items() if key != "procedure_id"}
+
+
+class Operator:
+    """Drives a case to the wanted number of punctures through the API alone."""
+
+    def __init__(
+        self, url: str, room: VirtualRoom, truth: TruthAddress, results_file: Path, seed: int
+    ) -> None:
+        self._http = httpx.Client(base_url=url, timeout=10.0)
+        self._room = room
+        self._truth = truth
+        self._results_file = results_file
+        self._seed = seed
+        self._failures = 0
+        self._failed_id: int | None = None
+        self._changed_s = time.monotonic()
+        self._last_event = -1
+        self.results = self._read_results()
+        self.state: dict[str, Any] = {}
+
+    def run(
+        self, punctures: int, look: Callable[[dict[str, Any]], None], check: Callable[[], None]
+    ) -> None:
+        """Act until the punctures are made; `look` sees every state, `check` may end it all."""
+        while True:
+            check()
+            try:
+                self.state = self._get("/api/v1/state")
+                look(self.state)
+                self._be_patient()
+                if not self._act(punctures):
+                    return
+            except httpx.TransportError:
+                # the service is gone or busy: `check` names a dead process in its next round
+                self._be_patient()
+            time.sleep(_POLL_S)
+
+    def close(self) -> None:
+        self._http.close()
+
+    def stop(self) -> None:
+        """Press STOP, if anybody still listens."""
+        try:
+            self._http.post("/api/v1/stop", json={"by": WHO}, timeout=1.0)
+        except httpx.HTTPError:
+            return
+
+    def _act(self, punctures: int) -> bool:
+        """Do the next thing that a person would do; False when there is nothing left."""
+        state = self.state
+        robot = state["robot"]
+        if not robot["linked"] or robot["moving"]:
+            return True
+        if robot["stopped"] or not robot["armed"] or not robot["position_certain"]:
+            self._post("/api/v1/reset")
+        elif state["question"] is not None:
+            self._answer(state["question"])
+        elif state["procedure"] is not None:
+            return True
+        elif state["ready"]:
+            self._puncture(state)
+        elif len(self.results) >= punctures:
+            return False
+        elif not state["calibrated"] or "calibrate again" in state["last_outcome"]:
+            self._note_failure(state)
+            self._post("/api/v1/calibration")
+        else:
+            self._note_failure(state)
+            self._set_target(state)
+            self._post("/api/v1/approach")
+        return True
+
+    def _answer(self, question: dict[str, Any]) -> None:
+        choice = next(
+            c for c in ("confirm", "rescan", *question["choices"]) if c in question["choices"]
+        )
+        self._post("/api/v1/answer", question_id=question["question_id"], choice=choice)
+
+    def _puncture(self, state: dict[str, Any]) -> None:
+        arrival = state["arrival"]
+        if not state["robot"]["insertion_locked"]:
+            return  # READY is complete only when motion is locked
+        if all(r.procedure_id != arrival["procedure_id"] for r in self.results):
+            self._write_result(self._result(arrival, state["target_patient_mm"]))
+            self._post("/api/v1/puncture")
+        self._post("/api/v1/needle-out")
+
+    def _result(self, arrival: dict[str, Any], target_mm: list[float]) -> PunctureResult:
+        stages = ask_where(self._truth)
+        fiducial_mm = true_fiducial_mm(self._room, stages.positions_mm)
+        # the needle guide is steered in the coronal plane: left-right and foot-head
+        miss = (np.asarray(fiducial_mm) - np.asarray(target_mm))[[0, 2]]
+        return PunctureResult(
+            procedure_id=arrival["procedure_id"],
+            true_error_mm=float(np.linalg.norm(miss)),
+            estimated_error_mm=arrival["error_mm"],
+            sigma_mm=arrival["sigma_mm"],
+            iterations=arrival["iterations"],
+            frames=arrival["frames"],
+            scan_s=arrival["scan_s"],
+        )
+
+    def _set_target(self, state: dict[str, Any]) -> None:
+        """A point within reach, the same one for the same seed and puncture."""
+        rng = np.random.default_rng((self._seed, len(self.results)))
+        along_x, along_z = rng.uniform(-_TARGET_REACH_MM, _TARGET_REACH_MM, 2).tolist()
+        x, y, z = self._origin_mm(state)
+        self._put("/api/v1/target", patient_mm=[x + along_x, y, z + along_z])
+
+    def _origin_mm(self, state: dict[str, Any]) -> tuple[float, float, float]:
+        """Where the fiducial was seen at the end of the calibration; kept for later targets."""
+        path = self._results_file.with_name("origin.json")
+        if not path.exists():
+            path.write_text(json.dumps(state["measurement"]["patient_mm"]))
+        x, y, z = json.loads(path.read_text())
+        return x, y, z
+
+    def _note_failure(self, state: dict[str, Any]) -> None:
+        """Give up when procedures keep failing; a single one is tried again."""
+        outcome = state["last_outcome"]
+        if " failed" not in outcome and " aborted" not in outcome:
+            self._failures = 0
+            return
+        self._failures += 1
+        if self._failures >= _MOST_FAILURES:
+            raise DemoFailedError(outcome)
+
+    def _be_patient(self) -> None:
+        """Nothing may stay without any event for longer than a person would wait."""
+        event = self.state.get("event_id", -1)
+        if event != self._last_event:
+            self._last_event, self._changed_s = event, time.monotonic()
+        elif time.monotonic() - self._changed_s > _PATIENCE_S:
+            prompt = self.state.get("prompt", "no state at all")
+            raise DemoFailedError(f"nothing happened for {_PATIENCE_S:.0f} s: {prompt}")
+
+    def _read_results(self) -> list[PunctureResult]:
+        if not self._results_file.exists():
+            return []
+        lines = self._results_file.read_text().splitlines()
+        return [PunctureResult(**json.loads(line)) for line in lines]
+
+    def _write_result(self, result: PunctureResult) -> None:
+        with self._results_file.open("a") as file:
+            file.write(json.dumps(asdict(result)) + "\n")
+        self.results.append(result)
+
+    def _get(self, path: str) -> dict[str, Any]:
+        answer = self._http.get(path)
+        answer.raise_for_status()
+        body: dict[str, Any] = answer.json()
+        return body
+
+    def _post(self, path: str, **body: Any) -> None:
+        self._accept(self._http.post(path, json={"by": WHO, **body}))
+
+    def _put(self, path: str, **body: Any) -> None:
+        self._accept(self._http.put(path, json={"by": WHO, **body}))
+
+    def _accept(self, answer: httpx.Response) -> None:
+        # 409: the room went on meanwhile; the next look at the state says how
+        if answer.status_code != 409:
+            answer.raise_for_status()

@@ -1,0 +1,217 @@
+"""The processes of the virtual room and the configuration that ties them together.
+
+motors (emulated controllers and stages) - bridge - serial line - service - worker - listener -
+scanner: all real processes on real DICOM, HTTP and serial bytes; only the physics is simulated.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from service.children import ChildError, Family, autospine
+from simulator.config import parse_virtual_room
+from simulator.faults import FAULTS
+from simulator.truth_client import TruthAddress, TruthError, ask_where
+
+AXES = ("xt", "yt")
+_TRAVEL_MM = 20.0
+_CONFIG = "room.toml"
+_CLOCK_OFFSET_S = 37.2
+
+
+@dataclass(frozen=True)
+class DemoOptions:
+    """What the user chose; port 0 means any free one."""
+
+    case_dir: Path
+    seed: int
+    faults: tuple[str, ...] = ()
+    page_port: int = 0
+    dicom_port: int = 0
+    speed_factor: float = 3.0
+
+
+class PortInUseError(Exception):
+    """A port that the user asked for cannot be had."""
+
+    exit_code = 2
+
+
+class DemoRoom:
+    """Start it, talk to it at `url`, end it. Everything it writes lies in the case folder."""
+
+    def __init__(self, options: DemoOptions) -> None:
+        self.options = options
+        self.folder = options.case_dir.resolve()
+        self.virtual_dir = self.folder / "virtual"
+        self.virtual_dir.mkdir(parents=True, exist_ok=True)
+        self.family = Family(self.folder / "logs")
+        self.url = ""
+        self.truth_port = 0
+        self.virtual_table: dict[str, Any] = {}
+
+    @property
+    def truth_file(self) -> Path:
+        return self.virtual_dir / "acquisitions.jsonl"
+
+    def start(self) -> None:
+        """Start all processes; ChildError if one does not come up. Call `end` in any case."""
+        motors = self.family.start("motors", self._motors_words())
+        self.truth_port = int(motors["truth_port"])
+        self.family.start("serial line", self._line_words())
+        config = self._write_config(self._ports())
+        here = ["--config", str(config)]
+        self.family.launch("bridge", [sys.executable, "-m", "robot_bridge", *here])
+        slow = [self.family.launch(n, autospine(n, *here)) for n in ("listener", "worker")]
+        self.url = str(self.family.start("service", autospine("service", *here))["url"])
+        for child in slow:
+            child.wait_ready(30.0)
+        self.family.start("scanner", autospine("scanner", *here))
+
+    def check(self) -> None:
+        """Raise ChildError if a process of the room has ended by itself."""
+        dead = self.family.dead()
+        if dead is not None:
+            raise ChildError(dead.describe_end())
+
+    def end(self) -> None:
+        """End all processes: those that command first, the motors last. Idempotent."""
+        self.family.end("service", "bridge")
+        self.family.end()
+
+    def wait_for_standstill(self, timeout_s: float = 5.0) -> str:
+        """Watch the true stages until nothing moves; say what was seen."""
+        if not self.truth_port:
+            return "the motors had not been started"
+        address = TruthAddress("127.0.0.1", self.truth_port)
+        deadline_s = time.monotonic() + timeout_s
+        try:
+            while ask_where(address).moving:
+                if time.monotonic() > deadline_s:
+                    return f"the stages still moved after {timeout_s:.0f} s"
+                time.sleep(0.05)
+        except TruthError:
+            return "the emulated motors are gone; nothing can move"
+        return "the stages stand still"
+
+    def _motors_words(self) -> list[str]:
+        return [
+            *(sys.executable, "-m", "simulator.motors"),
+            *("--pty-path", str(self.virtual_dir / "controllers")),
+            *("--axes", ",".join(AXES)),
+            *("--seed", str(self.options.seed)),
+            *("--state", str(self.virtual_dir / "stages.json")),
+            *("--speed-factor", str(self.options.speed_factor)),
+        ]
+
+    def _line_words(self) -> list[str]:
+        return [
+            *(sys.executable, "-m", "simulator.serial_line"),
+            *("--near", str(self.virtual_dir / "line-service")),
+            *("--far", str(self.virtual_dir / "line-bridge")),
+        ]
+
+    def _ports(self) -> tuple[int, int]:
+        """The ports of page and DICOM; free ones are found by binding them for a moment."""
+        wanted = (self.options.page_port, self.options.dicom_port)
+        probes = [socket.socket() for _ in wanted]
+        try:
+            for probe, port in zip(probes, wanted, strict=True):
+                probe.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+                try:
+                    probe.bind(("127.0.0.1", port))
+                except OSError as error:
+                    raise PortInUseError(f"port {port}: {error.strerror}") from None
+            first, second = (int(probe.getsockname()[1]) for probe in probes)
+        finally:
+            for probe in probes:
+                probe.close()
+        return first, second
+
+    def _write_config(self, ports: tuple[int, int]) -> Path:
+        page_port, dicom_port = ports
+        self.virtual_table = {
+            "seed": self.options.seed,
+            "faults": list(self.options.faults),
+            "scanner": {
+                "service_url": f"http://127.0.0.1:{page_port}",
+                "listener_port": dicom_port,
+                "motors_truth_port": self.truth_port,
+                "truth_file": str(self.truth_file),
+                "clock_offset_s": _CLOCK_OFFSET_S,
+            },
+        }
+        parse_virtual_room(self.virtual_table)
+        line = self.virtual_dir / "line-service"
+        tables = {
+            "room": {"name": "virtual room", "case_dir": str(self.folder), "virtual": True},
+            "listener": {
+                "port": dicom_port,
+                # as if the clocks had been compared at the console, to a fiftieth of a second
+                "clock_offset_s": -_CLOCK_OFFSET_S,
+                "clock_uncertainty_s": 0.02,
+                # the virtual scanner reconstructs in 0.15 s and sends at once
+                "prompt_delay_s": 0.3,
+            },
+            "service": {
+                "port": page_port,
+                "bridge_link": str(line),
+                "confirm_moves": False,
+                "settle_s": 0.15,
+            },
+            "virtual": {k: v for k, v in self.virtual_table.items() if k != "scanner"},
+            "virtual.scanner": self.virtual_table["scanner"],
+            "bridge": {
+                "link": str(self.virtual_dir / "line-bridge"),
+                "state_dir": str(self.virtual_dir / "bridge"),
+            },
+        }
+        axes = [self._axis_table(name, number) for number, name in enumerate(AXES, start=1)]
+        path = self.folder / _CONFIG
+        text = "# Written by `autospine demo`.\n" + _toml(tables)
+        text += "".join(f"\n[[bridge.axis]]\n{_toml_keys(axis)}" for axis in axes)
+        path.write_text(text, encoding="utf-8")
+        return path
+
+    def _axis_table(self, name: str, address: int) -> dict[str, Any]:
+        return {
+            "name": name,
+            "controller": str(self.virtual_dir / "controllers"),
+            "address": address,
+            "drive": "open_loop",
+            "travel_min_mm": -_TRAVEL_MM,
+            "travel_max_mm": _TRAVEL_MM,
+            "sign": 1,
+            "speed_hz": 1500,
+            "step_um_forward": 4.5,
+            "step_um_reverse": 4.5,
+        }
+
+
+def known_faults() -> Sequence[str]:
+    return tuple(FAULTS)
+
+
+def _toml(tables: Mapping[str, Mapping[str, Any]]) -> str:
+    return "".join(f"\n[{name}]\n{_toml_keys(keys)}" for name, keys in tables.items())
+
+
+def _toml_keys(keys: Mapping[str, Any]) -> str:
+    return "".join(f"{key} = {_toml_value(value)}\n" for key, value in keys.items())
+
+
+def _toml_value(value: Any) -> str:
+    if isinstance(value, bool):
+        return "true" if value else "false"
+    if isinstance(value, str):
+        escaped = value.replace("\\", "\\\\").replace('"', '\\"')
+        return f'"{escaped}"'
+    if isinstance(value, list | tuple):
+        return "[" + ", ".join(_toml_value(item) for item in value) + "]"
+    return repr(value)

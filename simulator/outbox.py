@@ -1,0 +1,155 @@
+"""The scanner's outbox: sends instances by C-STORE when they are due, and tries again.
+
+One thread of its own, so that a slow or dead receiver never keeps the scanner from scanning.
+"""
+
+import heapq
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from types import TracebackType
+
+from pydicom.dataset import Dataset
+from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
+from pynetdicom import AE
+from pynetdicom.association import Association
+from pynetdicom.sop_class import EnhancedMRImageStorage, MRImageStorage
+
+from simulator.config import ScannerSettings
+
+_TRANSFER_SYNTAXES = [ExplicitVRLittleEndian, ImplicitVRLittleEndian]
+
+
+@dataclass(frozen=True, order=True)
+class Push:
+    """One instance that waits to be sent; ordered by when it is due (time.monotonic)."""
+
+    due_s: float
+    sequence: int
+    dataset: Dataset = field(compare=False)
+    attempts: int = field(default=0, compare=False)
+
+
+@dataclass(frozen=True)
+class Delivery:
+    """What became of one push: status is the DIMSE status, or None if nobody answered."""
+
+    sop_instance_uid: str
+    sent: bool
+    attempts: int
+    status: int | None
+    reason: str
+
+
+class Outbox:
+    """Owns the sending thread. `report` is called from it, once for each push that has ended."""
+
+    def __init__(self, settings: ScannerSettings, report: Callable[[Delivery], None]) -> None:
+        self._settings = settings
+        self._report = report
+        self._waiting: list[Push] = []
+        self._sequence = 0
+        self._changed = threading.Condition()
+        self._stopped = False
+        self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
+
+    def __enter__(self) -> "Outbox":
+        self._thread.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        with self._changed:
+            self._stopped = True
+            self._changed.notify()
+        self._thread.join(timeout=10)
+
+    def push(self, dataset: Dataset, due_s: float) -> None:
+        """Send `dataset` as soon as time.monotonic() has reached `due_s`."""
+        with self._changed:
+            self._sequence += 1
+            heapq.heappush(self._waiting, Push(due_s, self._sequence, dataset))
+            self._changed.notify()
+
+    def _run(self) -> None:
+        while batch := self._next_batch():
+            for push in self._send(batch):
+                with self._changed:
+                    heapq.heappush(self._waiting, push)
+
+    def _next_batch(self) -> list[Push]:
+        """Wait until something is due; everything due, in order. Empty when stopped."""
+        with self._changed:
+            while not self._stopped:
+                now = time.monotonic()
+                if self._waiting and self._waiting[0].due_s <= now:
+                    return self._take_due(now)
+                wait_s = self._waiting[0].due_s - now if self._waiting else None
+                self._changed.wait(wait_s)
+            return []
+
+    def _take_due(self, now_s: float) -> list[Push]:
+        due = []
+        while self._waiting and self._waiting[0].due_s <= now_s:
+            due.append(heapq.heappop(self._waiting))
+        return due
+
+    def _send(self, batch: list[Push]) -> list[Push]:
+        """Send in one association; the pushes that are to be tried again."""
+        association = _associate(self._settings)
+        again = []
+        for push in batch:
+            status, reason = _store(association, push)
+            if status is not None and _is_stored(status):
+                self._report(self._delivery(push, True, status, "stored"))
+            elif _is_final(status) or push.attempts >= self._settings.retries:
+                self._report(self._delivery(push, False, status, reason))
+            else:
+                due_s = time.monotonic() + self._settings.retry_s
+                again.append(replace(push, due_s=due_s, attempts=push.attempts + 1))
+        if association.is_established:
+            association.release()
+        return again
+
+    @staticmethod
+    def _delivery(push: Push, sent: bool, status: int | None, reason: str) -> Delivery:
+        uid = str(push.dataset.SOPInstanceUID)
+        return Delivery(uid, sent, push.attempts + 1, status, reason)
+
+
+def _is_stored(status: int) -> bool:
+    """Success, or a warning with which the instance was stored all the same."""
+    return status == 0x0000 or status & 0xF000 == 0xB000
+
+
+def _is_final(status: int | None) -> bool:
+    """The receiver has understood and will not take it: wrong SOP class, cannot understand."""
+    return status is not None and (status & 0xFF00 == 0xA900 or status & 0xF000 == 0xC000)
+
+
+def _associate(settings: ScannerSettings) -> Association:
+    entity = AE(ae_title=settings.ae_title)
+    entity.acse_timeout = entity.dimse_timeout = entity.network_timeout = 10
+    for sop_class in (MRImageStorage, EnhancedMRImageStorage):
+        entity.add_requested_context(sop_class, _TRANSFER_SYNTAXES)
+    return entity.associate(
+        settings.listener_host, settings.listener_port, ae_title=settings.listener_ae_title
+    )
+
+
+def _store(association: Association, push: Push) -> tuple[int | None, str]:
+    if not association.is_established:
+        return None, "no association: refused, aborted or nobody there"
+    try:
+        status = association.send_c_store(push.dataset)
+    except (ValueError, RuntimeError) as error:
+        return None, str(error)
+    if "Status" not in status:
+        return None, "the receiver gave no answer"
+    comment = status.get("ErrorComment", "")
+    return int(status.Status), f"status 0x{int(status.Status):04X} {comment}".strip()

@@ -1,0 +1,277 @@
+"""The virtual room without processes, network or clocks: carries out the steps of a procedure.
+
+Stages, slices and the engine are those of the whole room; only what connects them is left out, and
+nobody waits. Procedures run in it as fast as the machine goes, and the truth is at hand.
+"""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from case_record.rows import SliceRow
+from robot_bridge.pmd_protocol import MICROSTEPS_PER_STEP
+from service.measuring import measure_request, measured_from_result
+from service.plane import ImagePlane
+from service.sensing import ABORT
+from service.steps import (
+    Acquire,
+    Acquired,
+    Answered,
+    AskOperator,
+    Measure,
+    Measured,
+    Moved,
+    MoveTo,
+    Outcome,
+    ProcedureSteps,
+    Step,
+)
+from simulator.camera import Camera, photograph
+from simulator.config import VirtualRoom
+from simulator.mr_slice import acquire, slice_geometry
+from simulator.scene import true_fiducial_mm
+from simulator.stage_physics import PiezoLegsStage, StageParameters
+from sr_engine.errors import EngineError
+from sr_engine.geometry import SliceGeometry
+from sr_engine.psf import Psf
+from sr_engine.worker import Frames, describe_result, localize_request
+
+Array = NDArray[np.float64]
+Result = TypeVar("Result")
+_DRIVE_HZ = 1000.0
+
+
+@dataclass(frozen=True, eq=False)
+class SeenSlice:
+    """What one acquisition gives: magnitude pixels (rows, cols) and where they lie."""
+
+    pixels: Array
+    geometry: SliceGeometry
+    row: SliceRow
+
+
+class Imaging(Protocol):
+    """A scanner or a camera: looks at the room, and knows where the fiducial truly is.
+
+    frame_s: what one image costs; psf: its point spread, None for the engine's
+    default; model_sigma_px: how far that may mislead the maximum-likelihood fit, per axis.
+    """
+
+    @property
+    def frame_s(self) -> float: ...
+
+    @property
+    def psf(self) -> Psf | None: ...
+
+    @property
+    def model_sigma_px(self) -> float: ...
+
+    def look(
+        self, stage_mm: Mapping[str, float], rng: np.random.Generator
+    ) -> tuple[Array, SliceGeometry]: ...
+
+    def true_plane_mm(self, stage_mm: Mapping[str, float]) -> Array:
+        """The fiducial's true position (2,) in the image plane, mm along rows and columns."""
+        ...
+
+
+@dataclass(frozen=True)
+class MrImaging:
+    """The virtual scanner; `frame_s` is what one slice costs."""
+
+    room: VirtualRoom
+    frame_s: float = 150.0
+    psf: Psf | None = None
+    model_sigma_px: float = 0.0
+
+    def look(
+        self, stage_mm: Mapping[str, float], rng: np.random.Generator
+    ) -> tuple[Array, SliceGeometry]:
+        taken = acquire(self.room, stage_mm, rng)
+        return taken.magnitude, taken.geometry
+
+    def true_plane_mm(self, stage_mm: Mapping[str, float]) -> Array:
+        return _true_plane_mm(self.room, stage_mm)
+
+
+@dataclass(frozen=True)
+class CameraImaging:
+    """The benchtop camera over the same stages."""
+
+    room: VirtualRoom
+    camera: Camera = Camera()
+    frame_s: float = 27.6
+    # what comes nearest to the camera's pixel and the interpolation together, and what it misses
+    psf: Psf | None = Psf("gaussian", (0.3,))
+    model_sigma_px: float = 0.022
+
+    def look(
+        self, stage_mm: Mapping[str, float], rng: np.random.Generator
+    ) -> tuple[Array, SliceGeometry]:
+        return photograph(self.room, stage_mm, self.camera, rng)
+
+    def true_plane_mm(self, stage_mm: Mapping[str, float]) -> Array:
+        return _true_plane_mm(self.room, stage_mm)
+
+
+def _true_plane_mm(room: VirtualRoom, stage_mm: Mapping[str, float]) -> Array:
+    plane = plane_of(slice_geometry(room.protocol))
+    return plane.from_patient(true_fiducial_mm(room, stage_mm).tolist())
+
+
+class OfflineRoom:
+    """Motors without encoders, as in the default room: a readback is the count of the steps sent.
+
+    answer: what the operator says to a question; confirms by default, and never rescans.
+    """
+
+    def __init__(
+        self,
+        imaging: Imaging,
+        stages: StageParameters,
+        seed: int,
+        *,
+        axes: tuple[str, ...] = ("xt", "yt"),
+        radius_mm: tuple[float, float] = (2.5, 6.5),
+        answer: Callable[[AskOperator], str] | None = None,
+    ) -> None:
+        self.imaging = imaging
+        self.stages = {
+            axis: PiezoLegsStage(stages, 0.0, random.Random(f"{seed}/{axis}")) for axis in axes
+        }
+        self.setpoints_um = dict.fromkeys(axes, 0)
+        # what the bridge is configured with, whatever the motors really are
+        self.nominal_step_um = dict.fromkeys(axes, stages.step_um)
+        self.nominal_mounting = dict.fromkeys(axes, stages.mounting)
+        self.stop_next_moves = 0
+        self.moves: list[dict[str, int]] = []
+        self.frames = 0
+        self.scan_s = 0.0
+        self._rng = np.random.default_rng(seed)
+        self._radius_mm = radius_mm
+        self._answer = answer or _agree
+        self._slices: dict[int, list[SeenSlice]] = {1: []}
+        self._measurements = 0
+
+    @property
+    def stage_mm(self) -> dict[str, float]:
+        """True positions of the stages."""
+        return {axis: stage.position_um / 1000.0 for axis, stage in self.stages.items()}
+
+    @property
+    def true_plane_mm(self) -> Array:
+        return self.imaging.true_plane_mm(self.stage_mm)
+
+    def run(self, procedure: ProcedureSteps[Result]) -> Result:
+        """Carry a procedure to its end; what it raises comes through."""
+        try:
+            step = next(procedure)
+            while True:
+                step = procedure.send(self.execute(step))
+        except StopIteration as finished:
+            result: Result = finished.value
+            return result
+
+    def execute(self, step: Step, command_id: str = "") -> Outcome:
+        if isinstance(step, MoveTo):
+            return self._move(step)
+        if isinstance(step, Acquire):
+            return self._acquire(step)
+        if isinstance(step, Measure):
+            return self._measure(step)
+        return Answered(self._answer(step), "operator")
+
+    def _move(self, step: MoveTo) -> Moved:
+        self.moves.append(dict(step.setpoints_um))
+        reached = 1.0
+        if self.stop_next_moves:
+            self.stop_next_moves -= 1
+            reached = 0.5
+        for axis, setpoint_um in step.setpoints_um.items():
+            change_um = round(reached * (setpoint_um - self.setpoints_um[axis]))
+            steps = change_um * self.nominal_mounting[axis] / self.nominal_step_um[axis]
+            drive(self.stages[axis], steps)
+            self.setpoints_um[axis] += change_um
+        hold_id = max(self._slices) + 1
+        self._slices[hold_id] = []
+        if reached < 1.0:
+            return Moved("STOPPED", "stopped", "STOP", hold_id, dict(self.setpoints_um))
+        return Moved("DONE", "", "", hold_id, dict(self.setpoints_um))
+
+    def _acquire(self, step: Acquire) -> Acquired:
+        if step.fresh:
+            self._slices[max(self._slices) + 1] = []
+        hold_id = max(self._slices)
+        slices = self._slices[hold_id]
+        while len(slices) < step.count:
+            pixels, geometry = self.imaging.look(self.stage_mm, self._rng)
+            slices.append(SeenSlice(pixels, geometry, self._row(hold_id)))
+        return Acquired(hold_id, len(slices))
+
+    def _row(self, hold_id: int) -> SliceRow:
+        """What the record would hold of the next slice; time is the scanner's alone."""
+        begin_s = self.scan_s
+        self.frames += 1
+        self.scan_s += self.imaging.frame_s
+        return SliceRow(
+            sop_instance_uid=f"2.25.{self.frames}",
+            frame=0,
+            sha256="",
+            path="",
+            state="assigned",
+            hold_id=hold_id,
+            reason_code="",
+            reason="",
+            received_s=self.scan_s,
+            received_monotonic_s=self.scan_s,
+            acquired_from_s=begin_s,
+            acquired_to_s=self.scan_s,
+            time_source="simulated",
+            header={},
+            slice_id=self.frames,
+        )
+
+    def _measure(self, step: Measure) -> Measured:
+        self._measurements += 1
+        taken = [(one, hold.shift_mm) for hold in step.holds for one in self._slices[hold.hold_id]]
+        geometry = taken[0][0].geometry
+        frames = Frames(
+            np.array([one.pixels for one, _ in taken]),
+            np.array([shift_mm for _, shift_mm in taken]) / np.array(geometry.spacing_mm),
+            geometry,
+            tuple(one.row for one, _ in taken),
+        )
+        try:
+            request = measure_request(step, self._radius_mm)
+            found = localize_request(frames, step.method, request, self.imaging.psf)
+        except EngineError as error:
+            return Measured(self._measurements, error.reason, str(error))
+        if step.method == "ml":
+            doubt = np.eye(2) * self.imaging.model_sigma_px**2
+            found = replace(found, covariance_px2=found.covariance_px2 + doubt)
+        return measured_from_result(self._measurements, describe_result(frames, found))
+
+
+def drive(stage: PiezoLegsStage, steps: float) -> None:
+    """One open-loop run of so many waveform steps; the sign is the motor's direction."""
+    microsteps = round(steps * MICROSTEPS_PER_STEP)
+    if microsteps == 0:
+        return
+    stage.unpark()
+    stage.begin_run()
+    stage.drive(microsteps, _DRIVE_HZ)
+    stage.park()
+
+
+def plane_of(geometry: SliceGeometry) -> ImagePlane:
+    return ImagePlane(geometry.row_direction, geometry.col_direction, geometry.spacing_mm)
+
+
+def _agree(question: AskOperator) -> str:
+    return ABORT if ABORT in question.choices else question.choices[0]

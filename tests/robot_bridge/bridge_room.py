@@ -1,0 +1,178 @@
+"""A small real room for tests: emulated controllers, a serial line, the daemon as a process."""
+
+import contextlib
+import json
+import random
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from robot_bridge.client import BridgeClient
+from robot_bridge.emulator import EmulatorServer, PseudoTerminal
+from robot_bridge.emulator_axis import EmulatedController, Motor
+from robot_bridge.emulator_bus import EmulatedBus
+from robot_bridge.emulator_physics import IdealStage
+from robot_bridge.emulator_switches import Switches
+from robot_bridge.phases import WorkPhase
+from simulator.serial_line import LineFaults, NullModem
+
+AXES = ("xt", "yt", "xb", "yb")
+
+CONFIG = """
+[bridge]
+link = "{link}"
+state_dir = "{state_dir}"
+heartbeat_s = 0.1
+deadman_s = 1.0
+{extra}
+"""
+
+AXIS = """
+[[bridge.axis]]
+name = "{name}"
+controller = "{controller}"
+address = {address}
+drive = "closed_loop"
+travel_min_mm = -15.0
+travel_max_mm = 15.0
+sign = 1
+speed_hz = {speed_hz}
+counts_per_mm = 10000
+tolerance_um = 20
+home_mm = 0.0
+"""
+
+
+class EmulatedControllers:
+    """Four closed-loop axes on one bus, served by a thread; their true positions are visible."""
+
+    def __init__(self) -> None:
+        switches = Switches()
+        self.stages = {name: IdealStage() for name in AXES}
+        controllers = [
+            EmulatedController(address, stage, Motor(), switches, time.monotonic(), 1.0)
+            for address, stage in enumerate(self.stages.values(), start=1)
+        ]
+        self.all = controllers
+        self.bus = EmulatedBus(controllers, switches, random.Random(0))
+        self._server = EmulatorServer(self.bus, PseudoTerminal())
+        self.url = self._server.wire.url
+        self._running = True
+        self.last_moving_s = 0.0
+        self._thread = threading.Thread(target=self._serve, name="controllers", daemon=True)
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while self._running:
+            self._server.serve_once()
+            if self.moving:
+                self.last_moving_s = time.monotonic()
+
+    def power_cycle(self) -> None:
+        for controller in self.all:
+            controller.power_on(time.monotonic(), deaf_s=0.2)
+
+    @property
+    def moving(self) -> bool:
+        return any(controller.moving for controller in self.all)
+
+    def positions_um(self) -> dict[str, float]:
+        return {name: stage.position_um for name, stage in self.stages.items()}
+
+    def close(self) -> None:
+        self._running = False
+        self._thread.join()
+        self._server.close()
+
+
+@dataclass
+class BridgeRoom:
+    folder: Path
+    controllers: EmulatedControllers
+    line: NullModem
+    config_file: Path
+    daemons: list[subprocess.Popen[str]] = field(default_factory=list)
+    clients: list[BridgeClient] = field(default_factory=list)
+    outcomes: list[object] = field(default_factory=list)
+
+    def start_daemon(
+        self, *arguments: str, python: Sequence[str] = (sys.executable, "-m", "robot_bridge")
+    ) -> subprocess.Popen[str]:
+        command = [*python, "--config", str(self.config_file)]
+        log = (self.folder / f"daemon-{len(self.daemons)}.log").open("w")
+        with log:
+            daemon = subprocess.Popen(
+                [*command, *arguments], stdin=subprocess.PIPE, stderr=log, text=True
+            )
+        self.daemons.append(daemon)
+        return daemon
+
+    @property
+    def log(self) -> str:
+        files = sorted(self.folder.glob("daemon-*.log"))
+        return "\n".join(file.read_text() for file in files)
+
+    def client(self, **settings: object) -> BridgeClient:
+        client = BridgeClient(self.line.far, heartbeat_s=0.1, **settings)  # type: ignore[arg-type]
+        self.clients.append(client)
+        return client
+
+    def ready_client(self) -> BridgeClient:
+        """Open, declared at zero, armed, in MANUAL."""
+        client = self.client()
+        client.open(15.0)
+        client.declare_position(dict.fromkeys(AXES, 0), "test")
+        client.set_phase(WorkPhase.MANUAL, "test")
+        client.arm("test")
+        return client
+
+    def status_file(self) -> dict[str, object]:
+        return json.loads((self.folder / "state" / "bridge_status.json").read_text())
+
+    def close(self) -> None:
+        for client in self.clients:
+            client.close()
+        for daemon in self.daemons:
+            if daemon.poll() is None:
+                daemon.terminate()
+        for daemon in self.daemons:
+            assert daemon.stdin is not None
+            with contextlib.suppress(BrokenPipeError):
+                daemon.stdin.close()
+            daemon.wait(10)
+        self.line.close()
+        self.controllers.close()
+
+
+@contextlib.contextmanager
+def bridge_room(
+    folder: Path, faults: LineFaults | None = None, *, seed: int = 0, speed_hz: int = 1500,
+    extra: str = "",
+) -> Iterator[BridgeRoom]:  # fmt: skip
+    controllers = EmulatedControllers()
+    line = NullModem(faults, seed=seed).start()
+    text = CONFIG.format(link=line.near, state_dir=folder / "state", extra=extra)
+    for address, name in enumerate(AXES, start=1):
+        text += AXIS.format(
+            name=name, controller=controllers.url, address=address, speed_hz=speed_hz
+        )
+    config_file = folder / "room.toml"
+    config_file.write_text(text)
+    room = BridgeRoom(folder, controllers, line, config_file)
+    try:
+        yield room
+    finally:
+        room.close()
+
+
+def wait_for(condition: object, timeout_s: float, what: str) -> float:
+    """Seconds until `condition()` was true."""
+    begun_s = time.monotonic()
+    while not condition():  # type: ignore[operator]
+        assert time.monotonic() - begun_s < timeout_s, f"{what}: not within {timeout_s} s"
+        time.sleep(0.002)
+    return time.monotonic() - begun_s

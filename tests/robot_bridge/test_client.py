@@ -1,0 +1,146 @@
+"""The client against the bridge in virtual time, on a clean line."""
+
+from pathlib import Path
+
+import pytest
+from axis_model import AXES
+from virtual_room import VirtualRoom
+
+from robot_bridge.client import LinkLostError, RefusedError
+from robot_bridge.messages import CommandState
+from robot_bridge.phases import WorkPhase
+
+
+@pytest.fixture
+def room(tmp_path: Path) -> VirtualRoom:
+    return VirtualRoom(tmp_path, seed=1)
+
+
+def ready(room: VirtualRoom):
+    client = room.client()
+    client.open()
+    client.declare_position(dict.fromkeys(AXES, 0), "test")
+    client.set_phase(WorkPhase.MANUAL, "test")
+    client.arm("test")
+    return client
+
+
+def at(um: int) -> dict[str, int]:
+    return {axis: um + offset for offset, axis in enumerate(AXES)}
+
+
+def test_a_move_ends_done_at_its_setpoints(room: VirtualRoom):
+    client = ready(room)
+    states = []
+    outcome = client.move("a", at(3000), None, lambda state, status: states.append(state))
+    assert outcome.state is CommandState.DONE
+    assert outcome.readback_um == room.stage.positions_um() == at(3000)
+    assert states == [CommandState.RUNNING, CommandState.DONE]
+
+
+def test_the_same_command_id_is_answered_from_the_journal_and_moves_nothing(room: VirtualRoom):
+    client = ready(room)
+    first = client.move("a", at(3000), "m1")
+    client.move("b", at(-3000), None)
+    again = client.move("a", at(3000), "m1")
+    assert again == first
+    assert len(room.stage.begun) == 2
+
+
+def test_after_a_restart_of_both_sides_the_same_id_still_gets_its_result(room: VirtualRoom):
+    first = ready(room).move("a", at(3000), "m1")
+    room.crash_bridge()
+    client = room.client()
+    client.open()
+    assert client.move("a", at(3000), "m1") == first
+    assert len(room.stage.begun) == 1
+
+
+def test_a_used_id_with_other_setpoints_is_refused(room: VirtualRoom):
+    client = ready(room)
+    client.move("a", at(3000), None)
+    outcome = client.move("a", at(2000), None)
+    assert (outcome.state, outcome.code) == (CommandState.REFUSED, "command_id_reused")
+    assert len(room.stage.begun) == 1
+
+
+def test_a_stop_from_outside_ends_the_move_as_stopped_and_latches(room: VirtualRoom):
+    client = ready(room)
+    called_s = []
+
+    def stop(state: CommandState, status: object) -> None:
+        if state is CommandState.RUNNING:
+            called_s.append(room.clock())
+            client.request_stop()
+
+    outcome = client.move("a", at(9000), None, stop)
+    assert (outcome.state, outcome.code) == (CommandState.STOPPED, "operator_stop")
+    assert client.stop_acknowledged
+    assert room.stage.stopped_s[0] - called_s[0] < 0.02
+    assert client.status.stopped
+    assert client.status.phase is WorkPhase.STOP
+    with pytest.raises(RefusedError, match="stop_latched"):
+        client.arm("test")
+    client.rearm("test")
+    assert client.status.armed
+    assert client.status.phase is WorkPhase.START_UP
+
+
+def test_a_latched_stop_survives_a_restart_of_the_bridge(room: VirtualRoom):
+    client = ready(room)
+    client.request_stop(emergency=True)
+    client.pump(0.1)
+    room.crash_bridge()
+    client.open()
+    assert client.status.stopped
+    assert client.status.phase is WorkPhase.EMERGENCY
+    with pytest.raises(RefusedError, match="stop_latched"):
+        client.arm("test")
+    client.rearm("test")
+    assert client.status.armed
+
+
+def test_silence_of_the_bridge_is_a_lost_link_and_open_begins_anew(room: VirtualRoom):
+    client = ready(room)
+    room.unplug()
+    begun_s = room.clock()
+    with pytest.raises(LinkLostError, match="nothing heard"):
+        client.pump(5.0)
+    assert room.clock() - begun_s < 1.5
+    room.plug_in()
+    client.open()
+    assert client.status.stop_reason == "link_lost"
+    assert not client.status.armed
+
+
+def test_a_restarted_bridge_ends_the_session_and_is_uncertain(room: VirtualRoom):
+    client = ready(room)
+    room.crash_bridge()
+    with pytest.raises(LinkLostError, match="does not know this session"):
+        client.pump(5.0)
+    hello = client.open()
+    assert hello.boot_id_changed
+    assert not hello.position_certain
+
+
+def test_a_second_session_ends_the_first(room: VirtualRoom):
+    first = ready(room)
+    second = room.client()
+    second.open()
+    assert not second.status.armed
+    with pytest.raises(LinkLostError, match="session"):
+        first.pump(1.0)
+
+
+def test_requests_without_a_session_are_a_lost_link(room: VirtualRoom):
+    with pytest.raises(LinkLostError, match="not open"):
+        room.client().arm("test")
+
+
+@pytest.mark.parametrize("value", [float("nan"), 1e300, 1.5, 10**12, True, None, "1"])
+def test_what_is_not_a_whole_micrometre_never_reaches_the_line(room: VirtualRoom, value):
+    client = ready(room)
+    outcome = client.move("a", {**at(0), "xt": value}, None)
+    assert (outcome.state, outcome.code) == (CommandState.REFUSED, "malformed")
+    assert "xt" in outcome.text
+    assert room.stage.begun == []

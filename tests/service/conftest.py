@@ -1,0 +1,25 @@
+"""Procedures in the offline room: the room's physics and the real engine, nobody waits."""
+
+from collections.abc import Callable
+
+import pytest
+from offline_arguments import calibration_arguments
+
+from service.calibration import Calibration, calibrate
+from simulator.config import VirtualRoom
+from simulator.stage_physics import StageParameters
+from studies.offline_room import MrImaging, OfflineRoom
+
+
+@pytest.fixture
+def make_room() -> Callable[..., OfflineRoom]:
+    def make(seed: int = 0, stages: StageParameters | None = None, **options) -> OfflineRoom:
+        return OfflineRoom(MrImaging(VirtualRoom()), stages or StageParameters(), seed, **options)
+
+    return make
+
+
+@pytest.fixture
+def calibrated(make_room) -> tuple[OfflineRoom, Calibration]:
+    room = make_room(seed=3)
+    return room, room.run(calibrate(calibration_arguments()))

@@ -1,0 +1,95 @@
+"""Calibration in the offline room: what it finds is true, what it says of its errors too."""
+
+import numpy as np
+import pytest
+from offline_arguments import calibration_arguments
+
+from service.calibration import calibrate
+from service.sensing import ProcedureFailedError
+from service.steps import MoveTo
+from simulator.config import Fiducial, StaticObject, VirtualRoom
+from simulator.stage_physics import StageParameters
+from sr_engine.shiftset import named
+from studies.offline_room import MrImaging, OfflineRoom
+
+ORIGIN = {"xt": 0, "yt": 0}
+
+
+def normalised_errors(shift_set, seeds):
+    found = []
+    for seed in seeds:
+        room = OfflineRoom(MrImaging(VirtualRoom()), StageParameters(), seed)
+        shifts = named(shift_set).shifts_px
+        calibration = room.run(calibrate(calibration_arguments(shifts_px=shifts)))
+        miss = room.true_plane_mm - calibration.estimate.plane_mm
+        found.append(miss @ np.linalg.solve(calibration.estimate.covariance_mm2, miss))
+    return np.array(found)
+
+
+@pytest.mark.parametrize("shift_set", ["single", "quarter"])
+def test_where_it_says_that_the_fiducial_is_has_an_honest_covariance(shift_set):
+    found = normalised_errors(shift_set, range(40))
+    assert 1.2 < found.mean() < 3.0  # two degrees of freedom; 40 draws scatter by 0.32
+    assert np.mean(found < 5.99) >= 0.85
+
+
+def test_its_moves_go_out_along_both_axes_and_back_to_the_origin(make_room):
+    room = make_room()
+    room.run(calibrate(calibration_arguments()))
+    assert room.moves == [
+        ORIGIN,
+        {"xt": 15_000, "yt": 0},
+        {"xt": 15_000, "yt": 15_000},
+        ORIGIN,
+    ]
+    assert room.frames == 4
+
+
+def test_the_jacobian_predicts_what_the_stages_really_do(calibrated, make_room):
+    _, calibration = calibrated
+    quiet = make_room(stages=StageParameters(scatter=0.0, repeatability_um=0.0, park_shift_um=0.0))
+    before = quiet.true_plane_mm
+    quiet.execute(MoveTo({"xt": 4000, "yt": -3000}, "test"))
+    predicted, covariance = calibration.jacobian.displacement({"xt": 4.0, "yt": -3.0})
+    miss = quiet.true_plane_mm - before - predicted
+    assert np.sqrt(miss @ np.linalg.solve(covariance, miss)) < 3.5
+
+
+def test_the_paper_random_set_serves_as_well(make_room):
+    shifts = ((0.0, 0.0), (0.7, -0.3), (-0.4, 0.9), (0.2, 0.6))
+    room = make_room(seed=4)
+    room.run(calibrate(calibration_arguments(shifts_px=shifts)))
+    assert room.frames == 8
+
+
+def test_a_stage_that_does_not_move_is_refused_and_said(make_room):
+    room = make_room()
+    room.stages["yt"].apply_load(2.0)  # beyond stall: the steps are counted, the stage stands
+    with pytest.raises(ProcedureFailedError, match=r"axis yt: the fiducial moved 0\.0"):
+        room.run(calibrate(calibration_arguments()))
+
+
+def test_motors_connected_crosswise_or_backwards_are_learnt_not_assumed():
+    room = OfflineRoom(MrImaging(VirtualRoom()), StageParameters(mounting=-1), 1)
+    calibration = room.run(calibrate(calibration_arguments(axes=("yt", "xt"))))
+    columns = calibration.jacobian.columns
+    # robot y is inferior, so the row index grows with it; robot x is left, so the column index
+    assert columns[0, 0] > 0.95
+    assert columns[1, 2] > 0.95
+
+
+def test_a_fiducial_that_is_not_in_the_slice_is_said_so():
+    room = OfflineRoom(
+        MrImaging(VirtualRoom(fiducials=(Fiducial(offset_mm=(0.0, 0.0, 30.0)),), background=())),
+        StageParameters(),
+        0,
+    )
+    with pytest.raises(ProcedureFailedError, match="no usable measurement: no round object"):
+        room.run(calibrate(calibration_arguments()))
+
+
+def test_two_equal_round_objects_are_refused_not_guessed():
+    twin = StaticObject(kind="sphere", centre_mm=(35.0, 58.0, 10.0), radius_mm=4.0, signal=1.0)
+    room = OfflineRoom(MrImaging(VirtualRoom(background=(twin,))), StageParameters(), 0)
+    with pytest.raises(ProcedureFailedError, match="two round objects are equally good"):
+        room.run(calibrate(calibration_arguments()))
