@@ -52,6 +52,11 @@ class StudyPoint:
     methods: tuple[str, ...] = METHODS
 
     @property
+    def frame_count(self) -> int:
+        """Frames that `sr` and `ml` are given."""
+        return 4 if self.shift_set == "paper" else len(shiftset.named(self.shift_set))
+
+    @property
     def hough(self) -> HoughSettings:
         return HoughSettings((self.radius_px / 2, 2 * self.radius_px), self.sensitivity)
 
@@ -140,7 +145,7 @@ def _frame_shape(point: StudyPoint) -> tuple[int, int]:
 def _shifts(point: StudyPoint, rng: np.random.Generator) -> Array:
     """The reference pose is that of the first frame, whatever the set."""
     if point.shift_set == "paper":
-        return shiftset.paper_random(rng).as_array()
+        return shiftset.paper_random(rng, point.frame_count).as_array()
     shifts = shiftset.named(point.shift_set).as_array()
     return np.asarray(shifts - shifts[0])
 

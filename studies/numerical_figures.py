@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from studies.numerical import METHODS, SCENES
-from studies.numerical_report import LABELS
+from studies.numerical_report import labels
 from studies.numerical_study import MAP_RADIUS_PX, MAP_SNR, NumericalStudy
 from studies.statistics import errors_px
 
@@ -51,7 +51,7 @@ def draw_scatter(study: NumericalStudy) -> Figure:
     limit = 1.35 * max(float(np.abs(errors_px(study.trials, m)).max()) for m in shown)
     for column, method in enumerate(METHODS):
         above, below = axes[0, column], axes[1, column]
-        above.set_title(LABELS[method], fontsize=11)
+        above.set_title(labels(study)[method], fontsize=11)
         if method in shown:
             _found_against_true(above, study, method)
             _error_cloud(below, study, method, limit)
@@ -111,10 +111,12 @@ def _curves(axes: Axes, study: NumericalStudy, scene: str, against: str) -> None
         has = [c for c in cells if method in c.summaries]
         where = [getattr(c.point, against) for c in has]
         means = [c.summaries[method].mean_error_px for c in has]
-        axes.plot(where, means, "o-", color=COLOURS[method], label=LABELS[method], markersize=4)
+        axes.plot(
+            where, means, "o-", color=COLOURS[method], label=labels(study)[method], markersize=4
+        )
     where = [getattr(c.point, against) for c in cells]
     bounds = [c.bound_px for c in cells]
-    axes.plot(where, bounds, "--", color="0.45", label="bound, 4 frames")
+    axes.plot(where, bounds, "--", color="0.45", label=f"bound, {study.point.frame_count} frames")
     axes.set(xscale="log", yscale="log")
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()

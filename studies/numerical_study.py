@@ -21,7 +21,7 @@ F_TESTS = (("base", "sr"), ("bicubic", "sr"), ("base", "bicubic"), ("sr", "ml1")
 
 @dataclass(frozen=True)
 class MapPoint:
-    """One cell of the map: its parameters, each method's errors, the bound with four frames."""
+    """One cell of the map: its parameters, each method's errors, the bound with all frames."""
 
     point: StudyPoint
     summaries: dict[str, Summary]
@@ -106,12 +106,15 @@ def run_study(
         trials=here,
         summaries=_summaries(here, main.methods),
         f_tests=[test for pair in F_TESTS if (test := f_test(here, *pair)) is not None],
-        bound_px={"ml1": bound_mean_error_px(main, 1), "ml": bound_mean_error_px(main, 4)},
+        bound_px={
+            "ml1": bound_mean_error_px(main, 1),
+            "ml": bound_mean_error_px(main, main.frame_count),
+        },
         cells=[
             MapPoint(
                 where,
                 _summaries(by_index[where.index], where.methods),
-                bound_mean_error_px(where, 4),
+                bound_mean_error_px(where, where.frame_count),
             )
             for where in points[1:]
         ],
