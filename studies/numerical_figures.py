@@ -105,6 +105,7 @@ def draw_map(study: NumericalStudy) -> Figure:
 
 def _curves(axes: Axes, study: NumericalStudy, scene: str, against: str) -> None:
     fixed, value = ("radius_px", 4.0) if against == "snr" else ("snr", 20.0)
+    named = labels(study)
     ticks = MAP_SNR if against == "snr" else MAP_RADIUS_PX
     cells = [c for c in study.cells if c.point.scene == scene and getattr(c.point, fixed) == value]
     for method in METHODS:

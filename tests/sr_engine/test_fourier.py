@@ -240,6 +240,7 @@ def test_filters_are_made_once_for_one_shift_set() -> None:
         (np.zeros((1, 9, 2)), [(0, 0)], ShapeError, "at least 4 px"),
         (np.zeros((1, 9)), [(0, 0)], ShapeError, "shape"),
         ("no pixels", [(0, 0)], ShapeError, "not a rectangular array"),
+        (np.zeros((1, 9, 9), complex), [(0, 0)], ShapeError, "complex"),
     ],
 )
 def test_bad_frames_and_shifts_give_a_typed_reason(
