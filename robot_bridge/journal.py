@@ -79,13 +79,15 @@ class Journal:
         self._sync = sync
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            is_new = not self.path.exists()
             self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC)
         except OSError as error:
             raise JournalError(f"{self.path}: cannot be opened: {error.strerror}") from error
         try:
             self._lock()
             self._load()
-            _sync_folder(folder)
+            if is_new:
+                _sync_folder(folder)
         except BaseException:
             os.close(self._fd)
             raise
