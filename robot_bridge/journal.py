@@ -87,7 +87,7 @@ class Journal:
             self._lock()
             self._load()
             if is_new:
-                _sync_folder(folder)
+                _sync_folder(folder, sync)
         except BaseException:
             os.close(self._fd)
             raise
@@ -217,9 +217,9 @@ def _end_entry(record: CommandRecord, wall_s: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _sync_folder(folder: Path) -> None:
+def _sync_folder(folder: Path, sync: Callable[[int], None]) -> None:
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        os.fsync(descriptor)
+        sync(descriptor)
     finally:
         os.close(descriptor)
