@@ -150,3 +150,17 @@ def test_without_a_bridge_the_error_is_one_line_and_exit_3(tmp_path: Path):
         assert ended.returncode == 3
         assert "no bridge answers" in ended.stderr
         assert ended.stderr.count("\n") == 1
+
+
+def test_stop_gets_through_while_another_program_has_the_line(tmp_path: Path):
+    with bridge_room(tmp_path) as room:
+        room.start_daemon()
+        client = room.ready_client()
+        ended = robot(room, "--timeout", "0.5", "stop")
+        assert ended.returncode == 3
+        assert "STOP was sent" in ended.stderr
+        client.pump(0.3)  # the other program's session still stands, and sees the stop
+        assert client.status.stopped
+        other = robot(room, "--timeout", "0.5", "status")
+        assert other.returncode == 3
+        assert "cannot be opened" in other.stderr
