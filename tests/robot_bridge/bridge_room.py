@@ -58,8 +58,8 @@ class EmulatedControllers:
             for address, stage in enumerate(self.stages.values(), start=1)
         ]
         self.all = controllers
-        bus = EmulatedBus(controllers, switches, random.Random(0))
-        self._server = EmulatorServer(bus, PseudoTerminal())
+        self.bus = EmulatedBus(controllers, switches, random.Random(0))
+        self._server = EmulatorServer(self.bus, PseudoTerminal())
         self.url = self._server.wire.url
         self._running = True
         self.last_moving_s = 0.0
@@ -71,6 +71,10 @@ class EmulatedControllers:
             self._server.serve_once()
             if self.moving:
                 self.last_moving_s = time.monotonic()
+
+    def power_cycle(self) -> None:
+        for controller in self.all:
+            controller.power_on(time.monotonic(), deaf_s=0.2)
 
     @property
     def moving(self) -> bool:
