@@ -18,7 +18,7 @@ from robot_bridge import pmd_protocol
 from robot_bridge.capture import CaptureWriter, CapturingPort
 from robot_bridge.config import AxisConfig
 from robot_bridge.motors import MotorError, MotorStatus
-from robot_bridge.pmd_axis import AxisFaultError, PmdAxis
+from robot_bridge.pmd_axis import POWER_ON_DELAY_US, AxisFaultError, PmdAxis
 from robot_bridge.pmd_line import PmdLine, Port, Procedure, Task
 from robot_bridge.pmd_protocol import PmdEchoError, PmdError, PmdTimeoutError
 
@@ -73,12 +73,16 @@ class PmdMotors:
         *,
         baud: int = 115200,
         timeout_s: float = 0.1,
+        response_delay_us: int = POWER_ON_DELAY_US,
         park_after_move: bool = False,
         capture_file: Path | None = None,
         clock: Callable[[], float] = time.monotonic,
         open_port: OpenPort | None = None,
     ) -> None:
-        self._axes = {config.name: PmdAxis(config, clock) for config in axes}
+        self._axes = {
+            config.name: PmdAxis(config, clock, response_delay_us=response_delay_us)
+            for config in axes
+        }
         self._timeout_s, self._clock = timeout_s, clock
         self._park_after_move = park_after_move
         self._capture_file = capture_file

@@ -38,9 +38,12 @@ AVOID_OVERSHOOT = 3
 NO_ENCODER = 0
 STALL_WINDOW_S = 0.5
 RUNAWAY_MARGIN_UM = 100.0
-# The response delay (Y44) returns to 20 us at every power-on and is not kept in flash: other
-# values tell that the controller has not lost its supply since we wrote them.
-POWER_ON_DELAY_US, INITIALISED_DELAY_US, DECLARED_DELAY_US = 20, 21, 22
+# The index offset (Y14) matters to index mode alone, which is not used here, is 0 at every power-on
+# and not kept in flash: other values tell that the controller has not lost its supply since we
+# wrote them, even if the answer with the latched reset bit was lost.
+MARK = 14
+POWER_ON_DELAY_US = 20  # Y44, before a controller answers
+POWER_ON_MARK, INITIALISED_MARK, DECLARED_MARK = 0, 10401, 10402
 
 
 class AxisFaultError(PmdError):
@@ -66,8 +69,15 @@ class _Run:
 
 
 class PmdAxis:
-    def __init__(self, config: AxisConfig, clock: Callable[[], float] = time.monotonic) -> None:
+    def __init__(
+        self,
+        config: AxisConfig,
+        clock: Callable[[], float] = time.monotonic,
+        *,
+        response_delay_us: int = POWER_ON_DELAY_US,
+    ) -> None:
         self.config = config
+        self._response_delay_us = response_delay_us
         self._clock = clock
         self.status = Status(0)
         self.certain = False
@@ -132,9 +142,12 @@ class PmdAxis:
     def _read_status(self) -> Steps[Status]:
         reply = yield from self._ask(self._status_body)
         self.status = parse_status(reply.value)
-        if reply.retried and (yield from self._ask("Y44")).integer() == POWER_ON_DELAY_US:
+        if reply.retried and (yield from self._read_mark()) == POWER_ON_MARK:
             self.status |= Status.RESET  # the answer that told it was lost
         return self.status
+
+    def _read_mark(self) -> Steps[int]:
+        return (yield from self._ask(f"Y{MARK}")).integer()
 
     def _read_position(self) -> Steps[None]:
         if self.closed_loop:
@@ -199,13 +212,13 @@ class PmdAxis:
         yield pmd_protocol.stop(self.address)
         first = yield from self._first_status()
         yield from self._read_status()  # what was latched is cleared now
-        mark = (yield from self._ask("Y44")).integer()
-        declared = mark == DECLARED_DELAY_US and not first & Status.RESET
+        mark = yield from self._read_mark()
+        declared = mark == DECLARED_MARK and not first & Status.RESET
         yield from self._apply_settings(MODELS[model])
         yield from self._read_position()
         self.certain = declared and self.closed_loop
         if not self.certain:
-            yield from self._set_all({44: INITIALISED_DELAY_US})
+            yield from self._set_all({MARK: INITIALISED_MARK})
         self._expected_parked = self.parked
         self._at_rest_um = self.position_um
         yield from self._check_status()
@@ -220,6 +233,8 @@ class PmdAxis:
         return (yield from self._read_status())
 
     def _apply_settings(self, model_max_hz: int) -> Steps[None]:
+        if (yield from self._ask("Y44")).integer() != self._response_delay_us:
+            yield from self._set_all({44: self._response_delay_us})
         if self.closed_loop:
             low, high = pmd_units.count_limits(self.config)
             yield from self._set_all(
@@ -438,7 +453,7 @@ class PmdAxis:
             yield from self._read_position()
             if abs(self.position_um - position_um) > self._arrival_um:
                 raise self._error("setting", f"reads {self.position_um:.0f} um after E{count}")
-            yield from self._set_all({44: DECLARED_DELAY_US})
+            yield from self._set_all({MARK: DECLARED_MARK})
         else:
             self.position_um = float(position_um)
         self._at_rest_um = self.position_um

@@ -80,11 +80,22 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return tmp_path_factory.mktemp("phases")
 
 
+_rooms: list[VirtualRoom] = []
+
+
+@pytest.fixture(autouse=True)
+def _journals_are_closed():
+    yield
+    while _rooms:
+        _rooms.pop().close()
+
+
 class Bench:
     """A bridge in exactly the wanted standing, reached through its own doors where there are."""
 
     def __init__(self, folder: Path, case: Case) -> None:
         self.room = VirtualRoom(folder / f"{next(_number)}", seed=3)
+        _rooms.append(self.room)
         bridge = self.room.bridge
         assert bridge is not None
         self.bridge: Bridge = bridge
