@@ -18,6 +18,7 @@ def run(folder: Path, seed: int, commands: int) -> Campaign:
     assert sum(findings.harm.values()) == 0, (seed, findings)
     assert findings.commands >= commands
     assert again_asked_moves_nothing(campaign, sample=min(50, commands))
+    campaign.room.close()
     return campaign
 
 

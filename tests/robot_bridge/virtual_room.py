@@ -93,9 +93,8 @@ class VirtualRoom:
         self.bridge_back_s = self.clock() + away_s
 
     def close(self) -> None:
-        """The test is over: give the journal's file back."""
-        if self._journal is not None:
-            self._journal.close()
+        assert self._journal is not None
+        self._journal.close()
 
     @property
     def commands(self) -> dict[str, CommandRecord]:
