@@ -39,6 +39,7 @@ the table by itself. Travel limits have no default on purpose.
 | `motion_timeout_s` | 60 | A motion that lasts longer is stopped. |
 | `motion_poll_s` | 0.02 | How often the controllers are asked during a motion. |
 | `controller_baud`, `controller_timeout_s` | 115200, 0.1 | The line to the controllers. |
+| `controller_response_delay_us` | 20 | Their pause before an answer; more behind a fibre converter. |
 | `park_after_move` | false | Park the drives after every move (a powered drive costs SNR). |
 | `guardian` | true | A second process that stops the motors if the daemon is killed. |
 | `capture_file` | none | Every byte to and from the controllers. |
