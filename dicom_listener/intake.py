@@ -200,7 +200,8 @@ class Intake:
         for slice_ in slices:
             against = self._against(slice_, envelope, problems, conflict)
             decision = against or self._assign(slice_, envelope.received_s, self._known_now(rows))
-            rows.append(row_of(slice_, envelope, name, decision))
+            arrival_mode = self._rules.assign.arrival_mode
+            rows.append(row_of(slice_, envelope, name, decision, arrival_mode=arrival_mode))
         return rows, list(slices)
 
     def _read(self, path: Path, envelope: Envelope) -> list[Slice]:

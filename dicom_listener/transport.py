@@ -8,6 +8,7 @@ A health check that connects and goes, a peer that says nothing, half a PDU, a T
 never ends: each holds one thread for a bounded time, and their number is bounded too.
 """
 
+import contextlib
 import selectors
 import socket
 import ssl
@@ -71,6 +72,13 @@ class BoundedSocket(AssociationSocket):
             if len(received) < nr_bytes and time.monotonic() > deadline_s:
                 self._refuse(f"a PDU took longer than {self.pdu_deadline_s:g} s")
         return received
+
+    def _shutdown_socket(self) -> None:
+        """Close in any case. (pynetdicom's own leaves it open where the peer is gone already.)"""
+        if self.socket is not None:
+            with contextlib.suppress(OSError):
+                self.socket.shutdown(socket.SHUT_RDWR)
+            self.socket.close()
 
     def _check_size(self, nr_bytes: int) -> None:
         self.message_bytes += nr_bytes
