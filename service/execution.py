@@ -31,6 +31,12 @@ from service.steps import (
 _SERVICE = "service"
 
 
+def _phase_of(purpose: str) -> WorkPhase:
+    if "calib" in purpose:
+        return WorkPhase.CALIBRATION
+    return WorkPhase.MANUAL if purpose == "manual" else WorkPhase.MOVE_TO_TARGET
+
+
 class ProcedureAbortedError(Exception):
     """The operator ended the procedure, or STOP did. The robot stands still."""
 
@@ -95,7 +101,7 @@ class Execution:
     # Moves
 
     def _move(self, step: MoveTo, command_id: str) -> Moved:
-        phase = WorkPhase.CALIBRATION if "calib" in step.purpose else WorkPhase.MOVE_TO_TARGET
+        phase = _phase_of(step.purpose)
         measurement = None if step.rests_on is None else str(step.rests_on)
         while True:
             self._wait_until_ready_to_move()
@@ -241,7 +247,7 @@ class Execution:
         imaging = self._config.imaging
         radius_mm = (imaging.fiducial_radius_min_mm, imaging.fiducial_radius_max_mm)
         hold_ids = [h.hold_id for h in step.holds]
-        request = measure_request(step, radius_mm)
+        request = measure_request(step, radius_mm, imaging.start_region_px)
         number = self._record.request_measurement(step.method, hold_ids, request)
         self.prompt = "Localizing the fiducial."
         while (measurement := self._record.measurement(number)).state == "requested":

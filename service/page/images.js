@@ -7,7 +7,7 @@ import { act, arrow } from "./next.js";
 import { natural, SliceView } from "./slice_view.js";
 import { age, clock } from "./words.js";
 
-const LAYOUTS = [["slice", "Slice"], ["both", "Side by side"], ["reconstruction", "Reconstruction"], ["blend", "Blended"]];
+const LAYOUTS = [["slice", "Slice"], ["both", "Both"], ["reconstruction", "Reconstruction"], ["blend", "Blended"]];
 const NUDGE_MM = 0.1;
 
 export class Images {
@@ -22,7 +22,7 @@ export class Images {
     };
     this.slice = new SliceView("Slice", on);
     this.sr = new SliceView("Reconstruction", on);
-    this.layout = "slice";
+    this.layout = "both";
     this.picked = null;
     this.build();
     this.loadSlice = whenChanged((slice) => this.fetchSlice(slice));
@@ -37,7 +37,7 @@ export class Images {
     this.level = h("input", { type: "range", min: 0, max: 1000, value: 500, oninput: () => this.slid() });
     this.share = h("input", { type: "range", min: 0, max: 100, value: 50, oninput: () => this.repaint() });
     this.shareLabel = h("label", { hidden: true }, "Blend ", this.share);
-    this.smooth = h("button", { type: "button", "aria-pressed": "false", onclick: () => this.toggleSmooth() }, "Smooth");
+    this.smooth = h("button", { type: "button", "aria-pressed": "false", class: "wide-only", onclick: () => this.toggleSmooth() }, "Smooth");
     this.picking = h("button", { type: "button", id: "pick", "aria-pressed": "false", onclick: () => this.togglePick() }, "Pick target");
     this.bar = h("div", { class: "bar" },
       h("span", { class: "group", role: "group", "aria-label": "Which image" }, this.buttons),
@@ -57,7 +57,6 @@ export class Images {
     this.pickBar = h("div", { class: "pick", hidden: true });
     replace(this.root, this.bar, this.views, this.pickBar,
       h("div", { class: "read" }, this.ageText, this.source, this.cursor));
-    this.sr.root.hidden = true;
   }
 
   setLayout(layout) {
@@ -97,7 +96,7 @@ export class Images {
   async fetchSr({ id }) {
     const geometry = this.state.reconstruction;
     try {
-      this.sr.show(geometry, await getPixels(`/api/v1/measurements/${id}/pixels`), `Reconstruction ×${geometry.factor}, measurement ${id}`);
+      this.sr.show(geometry, await getPixels(`/api/v1/measurements/${id}/pixels`), `×${geometry.factor}, measurement ${id}`);
     } catch (error) {
       this.sr.clear(error.message);
     }

@@ -32,6 +32,18 @@ export function actionsFor(state) {
   return list.sort((a, b) => (a.last ? 1 : 0) - (b.last ? 1 : 0));
 }
 
+const drawChips = whenChanged((robot) => {
+  const chip = (words, kind) => h("li", { class: kind }, words);
+  const rows = robot.linked ? [
+    robot.stopped ? chip("Stopped", "bad") : chip(robot.armed ? "Armed" : "Not armed", robot.armed ? "on" : ""),
+    chip(robot.moving ? "Moving" : "Standing still", robot.moving ? "hot" : "on"),
+    robot.insertion_locked ? chip("Motion locked for the needle", "hot") : null,
+    robot.position_certain ? null : chip("Position not certain", "bad"),
+    robot.fault ? chip(`Fault: ${robot.fault}`, "bad") : null,
+  ] : [chip("No link to the robot", "bad")];
+  replace(byId("chips"), rows);
+});
+
 export class Next {
   constructor() {
     this.drawActions = whenChanged((key, state) => this.actions(state));
@@ -41,7 +53,10 @@ export class Next {
 
   draw(state, role) {
     this.mayAct = role === "operator";
-    setText(byId("prompt"), state.prompt);
+    setText(byId("prompt"), promptOf(state));
+    byId("prompt").classList.toggle("ready", state.ready);
+    byId("prompt").classList.toggle("long", state.prompt.length > 80);
+    drawChips({ linked: state.robot.linked, stopped: state.robot.stopped, armed: state.robot.armed, moving: state.robot.moving, insertion_locked: state.robot.insertion_locked, position_certain: state.robot.position_certain, fault: state.robot.fault });
     setText(byId("prompt-more"), this.more(state));
     this.drawQuestion(state.question, state);
     this.drawActions([role, actionsFor(state).map((action) => action.label), state.question?.question_id, state.measurement?.measurement_id], state);
@@ -103,14 +118,17 @@ export class Next {
   }
 }
 
+function promptOf({ prompt, question }) {
+  if (!question?.plan) return prompt;
+  return `Confirm the move of ${mm(Math.hypot(...question.plan.displacement_mm), 3)} mm?`;
+}
+
 function planTable(plan, state) {
   const [row, col] = plan.displacement_mm;
-  const long = Math.hypot(row, col);
   const reach = 1.25 * Math.max(Math.abs(row), Math.abs(col), 0.01);
   const axes = Object.entries(plan.setpoints_um).filter(([axis, um]) => um !== plan.from_um[axis]);
   return h("div", { class: "error-grid" },
     h("div", {},
-      h("p", {}, h("b", { class: "num" }, `${mm(long, 3)} mm`)),
       h("p", { class: "quiet" }, state.slice ? inWords(state.slice, row, col, 3) : `row ${signedMm(row)}, column ${signedMm(col)} mm`),
       h("table", {}, h("tbody", {}, axes.map(([axis, um]) => h("tr", {},
         h("th", { scope: "row" }, axis),

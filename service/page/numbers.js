@@ -16,7 +16,7 @@ function closeUp(error, toleranceMm, covariance) {
     "aria-label": `Close-up: the fiducial is ${mm(error.error_mm, 3)} mm from the target`,
   },
   s("circle", { r: reach * 0.98, class: "thin", stroke: "var(--line)" }),
-  s("circle", { r: toleranceMm, class: "thin c-target", "fill-opacity": 0.12, style: null }),
+  s("circle", { r: toleranceMm, class: "thin c-target", "data-what": "tolerance" }),
   s("path", { d: `M${-reach} 0H${reach}M0 ${-reach}V${reach}`, class: "thin", stroke: "var(--line)" }),
   s("line", { x1: at[0], y1: at[1], x2: 0, y2: 0, class: "thin c-plan dash" }),
   s("ellipse", {
@@ -48,7 +48,7 @@ export const drawNumbers = whenChanged(({ error, measurement, tolerance_mm, arri
   replace(body,
     h("div", { class: "error-grid" },
       h("div", {},
-        h("p", { class: `big ${inside ? "inside" : "outside"}` }, mm(shown.error_mm, 3), h("small", {}, " mm")),
+        h("p", { class: `big ${inside ? "inside" : "outside"}` }, mm(shown.error_mm, shown.error_mm < 10 ? 3 : 2), h("small", {}, " mm")),
         h("p", { class: "pm" }, `± ${mm(shown.sigma_mm, 3)} mm`, h("span", { class: "quiet" }, " (1 σ)"))),
       closeUp(error, tolerance_mm, measurement?.covariance_mm2)),
     h("p", { class: "quiet" }, slice ? `The target lies ${inWords(slice, error.row_mm, error.col_mm, 3)}.` : ""),

@@ -5,25 +5,29 @@ import { mm } from "./words.js";
 
 const STAGES = [["top stage", "xt", "yt"], ["bottom stage", "xb", "yb"]];
 
+const [SIDE, PAD] = [80, 10];
+
 function one([name, x, y], robot, plan) {
   const [x0, x1] = robot.travel_um[x];
   const [y0, y1] = robot.travel_um[y];
   const at = [robot.positions_um[x], robot.positions_um[y]];
-  const size = Math.max(x1 - x0, y1 - y0);
-  const pad = 0.13 * size;
-  const to = plan && [plan.setpoints_um[x] ?? at[0], plan.setpoints_um[y] ?? at[1]];
+  const scale = SIDE / Math.max(x1 - x0, y1 - y0);
+  const [wide, high] = [(x1 - x0) * scale, (y1 - y0) * scale];
   // y grows upwards on the map, downwards in SVG
-  const text = (dx, dy, anchor, words) => s("text", { x: dx, y: dy, "text-anchor": anchor, "font-size": size * 0.055, class: "map" }, words);
-  return s("svg", { viewBox: `${x0 - pad} ${-y1 - pad} ${x1 - x0 + 2 * pad} ${y1 - y0 + 2 * pad}`, role: "img",
+  const place = ([px, py]) => [(px - x0) * scale, (y1 - py) * scale];
+  const [cx, cy] = place(at);
+  const to = plan && place([plan.setpoints_um[x] ?? at[0], plan.setpoints_um[y] ?? at[1]]);
+  const text = (dx, dy, anchor, words) => s("text", { x: dx, y: dy, "text-anchor": anchor }, words);
+  return s("svg", { viewBox: `${-PAD} ${-PAD} ${wide + 2 * PAD} ${high + 2 * PAD}`, role: "img",
     "aria-label": `${name}: ${x} ${mm(at[0] / 1000, 3)} mm, ${y} ${mm(at[1] / 1000, 3)} mm` },
-  s("rect", { x: x0, y: -y1, width: x1 - x0, height: y1 - y0, class: "thin", stroke: "var(--quiet)" }),
-  s("path", { d: `M${x0} ${-(y0 + y1) / 2}H${x1}M${(x0 + x1) / 2} ${-y1}V${-y0}`, class: "thin", stroke: "var(--line)" }),
-  to && s("line", { x1: at[0], y1: -at[1], x2: to[0], y2: -to[1], class: "thin c-plan" }),
-  to && s("circle", { cx: to[0], cy: -to[1], r: size * 0.025, class: "thin c-plan" }),
-  s("circle", { cx: at[0], cy: -at[1], r: size * 0.022, fill: robot.position_certain ? "var(--fiducial)" : "none", class: "thin c-fiducial" }),
-  text(x0, -y0 + pad * 0.75, "start", `${mm(x0 / 1000, 0)}`), text(x1, -y0 + pad * 0.75, "end", `${mm(x1 / 1000, 0)} mm`),
-  text((x0 + x1) / 2, -y0 + pad * 0.75, "middle", `${x} ${mm(at[0] / 1000, 3)}`),
-  text((x0 + x1) / 2, -y1 - pad * 0.3, "middle", `${y} ${mm(at[1] / 1000, 3)}`));
+  s("rect", { width: wide, height: high, class: "thin", stroke: "var(--quiet)" }),
+  s("path", { d: `M0 ${high / 2}H${wide}M${wide / 2} 0V${high}`, class: "thin", stroke: "var(--line)" }),
+  to && s("line", { x1: cx, y1: cy, x2: to[0], y2: to[1], class: "thin c-plan" }),
+  to && s("circle", { cx: to[0], cy: to[1], r: 2.6, class: "thin c-plan" }),
+  s("circle", { cx, cy, r: 2, fill: robot.position_certain ? "var(--fiducial)" : "none", class: "thin c-fiducial" }),
+  text(0, high + 7, "start", mm(x0 / 1000, 0)), text(wide, high + 7, "end", mm(x1 / 1000, 0)),
+  text(wide / 2, high + 7, "middle", `${x} ${mm(at[0] / 1000, 3)} mm`),
+  text(0, -3, "start", mm(y1 / 1000, 0)), text(wide / 2, -3, "middle", `${y} ${mm(at[1] / 1000, 3)} mm`));
 }
 
 export const drawStages = whenChanged(({ robot, plan }) => {

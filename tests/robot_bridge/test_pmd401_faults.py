@@ -1,11 +1,8 @@
 """Faults of line, controller, motor and encoder: a typed fault, and all motors stopped."""
 
-import logging
 import time
 
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 from pmd_rig import Rig, axis_config, finish, opened, rig, wait_until
 
 from robot_bridge.emulator_physics import IdealStage
@@ -178,52 +175,6 @@ def test_a_closed_loop_move_corrects_a_slip_on_the_way():
         assert made.position_um(1) == pytest.approx(5000, abs=1)
 
 
-DAMAGE = ("drop_replies", "garble_replies", "truncate_replies", "garble_commands")
-
-
-@pytest.mark.parametrize(
-    ("drive", "kind"),
-    [("open_loop", kind) for kind in DAMAGE] + [("closed_loop", "garble_commands")],
-)
-def test_damage_at_any_place_of_a_move_never_moves_twice_or_elsewhere(drive: str, kind: str):
-    """Damage the n-th line of a move for every n: it arrives, or it ends in a fault."""
-    faults = []
-    with rig((1,)) as made:
-        motors = PmdMotors([axis_config("xt", made.url, 1, drive)], timeout_s=0.02)
-        motors.open()
-        for nth in range(14):
-            start_again(motors, made)
-            runs, lines = made.runs(), made.bus.lines_received
-            motors.move_to({"xt": 1000})
-            wait_until(motors, lambda s, end=lines + nth: made.bus.lines_received >= end)
-            with made.lock:
-                setattr(made.bus.faults, kind, 1)
-            status = finish(motors)
-            settled(motors)
-            with made.lock:
-                setattr(made.bus.faults, kind, 0)
-                assert not any(c.moving for c in made.bus.controllers)
-            assert made.runs() - runs <= (1 if drive == "open_loop" else 2)  # T may be repeated
-            assert -25 <= made.position_um(1) <= 1001
-            if status.reached:
-                assert made.position_um(1) == pytest.approx(1000, abs=1)
-            else:
-                assert status.fault is not None
-            faults.append(status.fault)
-        motors.close()
-    assert None in faults  # damage is survived wherever repeating is safe
-
-
-def start_again(motors: PmdMotors, made: Rig) -> None:
-    """At zero again, whatever happened before."""
-    motors.stop()
-    with made.lock:
-        stage = made.controller(1).physics
-        stage.displace(-stage.position_um)
-        made.controller(1).advance(time.monotonic())
-    motors.declare_position({"xt": 0})
-
-
 def test_one_wrong_bit_that_makes_a_motion_of_a_status_question_is_stopped_at_once():
     """`U0` and `T0` differ by one bit: the controller would go to zero."""
     switches = Switches(bare_status=False)
@@ -354,42 +305,3 @@ def test_a_shift_by_parking_is_told():
         assert status.readback_um["xt"] == 530
         assert not status.reached
         assert any("parking moved it by +30 um" in warning for warning in status.warnings)
-
-
-@settings(max_examples=6, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1))
-def test_on_a_noisy_line_no_move_ends_anywhere_but_at_its_setpoint_or_in_a_fault(seed: int):
-    noisy_moves(seed)
-
-
-@pytest.mark.soak
-@settings(max_examples=500, deadline=None)
-@given(seed=st.integers(0, 2**32 - 1), drive=st.sampled_from(["open_loop", "closed_loop"]))
-def test_many_noisy_lines(seed: int, drive: str):
-    noisy_moves(seed, drive)
-
-
-def noisy_moves(seed: int, drive: str = "open_loop") -> None:
-    logging.getLogger("robot_bridge.pmd401").setLevel(logging.ERROR)
-    with rig((1,), seed=seed) as made:
-        motors = PmdMotors([axis_config("xt", made.url, 1, drive)], timeout_s=0.02)
-        motors.open()
-        motors.declare_position({"xt": 0})
-        made.bus.faults.drop_probability = made.bus.faults.garble_probability = 0.02
-        made.bus.faults.garble_command_probability = 0.02
-        for setpoint_um in (600, -200, 900):
-            status = motors.poll()
-            if not status.certain:
-                break
-            try:
-                motors.move_to({"xt": setpoint_um})
-            except MotorError:
-                continue
-            finish(motors)
-            settled(motors)
-            status = motors.poll()
-            if status.reached and status.certain:
-                assert made.position_um(1) == pytest.approx(setpoint_um, abs=2)
-            else:
-                assert status.fault is not None or not status.certain
-        motors.close()

@@ -1,6 +1,8 @@
 """The virtual scanner between a real HTTP server, a real C-STORE receiver and a truth server."""
 
+import shutil
 import socket
+import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -12,10 +14,11 @@ from typing import Any
 import numpy as np
 import pytest
 from neighbours import Page, Receiver, Stages, Start
+from pydicom import dcmread
 
 from simulator.config import VirtualRoom, VirtualRoomError
 from simulator.mr_slice import acquire
-from simulator.scanner import operate
+from simulator.scan_operator import operate
 from simulator.scene import true_fiducial_mm
 from sr_engine.geometry import SliceGeometry
 
@@ -134,6 +137,30 @@ def test_a_slice_taken_while_the_stages_move_is_marked_so_in_the_truth_and_is_sm
     )
     assert still < 60, "noise of both slices: 33 times the root of two"
     assert moving > 2 * still
+
+
+@pytest.mark.parametrize("sop_class", ["classic", "enhanced"])
+def test_dcmtks_storescp_takes_the_slices(
+    start: Start, page: Page, tmp_path: Path, sop_class: str
+) -> None:
+    if shutil.which("storescp") is None:
+        pytest.skip("storescp (Debian package dcmtk) is not installed")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    folder = tmp_path / "received"
+    folder.mkdir()
+    command = ["storescp", "-aet", "AUTOSPINE", "-od", str(folder), "-fe", ".dcm", str(port)]
+    with subprocess.Popen(command) as storescp:
+        try:
+            running = start({"listener_port": port, "sop_class": sop_class})
+            page.ask_for("r1", count=3)
+            deliveries = running.wait_for_truth(3, "delivery")
+        finally:
+            storescp.terminate()
+    assert all(line["sent"] for line in deliveries)
+    received = {dcmread(path).SOPInstanceUID for path in folder.glob("*.dcm")}
+    assert received == {line["sop_instance_uid"] for line in running.truth()}
 
 
 # pynetdicom leaves the socket of a refused connection to the garbage collector
