@@ -92,6 +92,16 @@ class BoundedSocket(AssociationSocket):
         raise OSError(why)
 
 
+class SharedContexts(list[Any]):
+    """Presentation contexts that all associations share: nobody changes them once we serve.
+
+    pynetdicom copies them deeply for every association, which takes longer than all the rest.
+    """
+
+    def __deepcopy__(self, memo: Any) -> "SharedContexts":
+        return self
+
+
 class PromptRequestHandler(RequestHandler):
     server: "PromptServer"
 
@@ -120,6 +130,7 @@ class PromptServer(ThreadedAssociationServer):
         self._unopened = threading.BoundedSemaphore(self.most_unopened)
         kwargs["request_handler"] = PromptRequestHandler
         super().__init__(*args, **kwargs)
+        self.contexts: SharedContexts = SharedContexts(self.contexts)
 
     def get_request(self) -> tuple[socket.socket, Any]:
         # No TLS here: a handshake in this thread would let one silent peer stop everyone.
