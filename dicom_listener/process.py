@@ -128,7 +128,6 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             inbox_folder(config.room.case_dir),
             min_free_bytes=config.listener.min_free_mib * _MIB,
         )
-        stack.callback(inbox.close)
         discarded = inbox.discard_unfinished()
         intake = Intake(record, inbox, intake_rules(config, time.time()), metrics)
         scp = open_scp(config.listener, inbox, metrics, received.put)

@@ -14,32 +14,26 @@ import json
 import logging
 import math
 import secrets
-import socket
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
-from robot_bridge import step_calibration
-from robot_bridge.__main__ import (
-    EXIT_BAD_INPUT,
-    EXIT_COULD_NOT,
-    EXIT_DONE,
-    make_guardian,
-    make_motors,
-)
+from robot_bridge import sessions
+from robot_bridge.__main__ import EXIT_BAD_INPUT, EXIT_COULD_NOT, EXIT_DONE, make_motors
+from robot_bridge.calibrate_steps import CalibrationError, calibrate_steps
 from robot_bridge.client import BridgeClient, BridgeError, BridgeStatus, MoveOutcome, RefusedError
-from robot_bridge.config import BridgeConfig, ConfigError, load_bridge_config
-from robot_bridge.daemon import Daemon
-from robot_bridge.journal import Journal, JournalError
+from robot_bridge.config import AxisConfig, BridgeConfig, ConfigError, load_bridge_config
+from robot_bridge.journal import JournalError
 from robot_bridge.motors import MotorError
 from robot_bridge.phases import WorkPhase
-from robot_bridge.transport import DescriptorTransport
 
+COULD_NOT = (CalibrationError, JournalError, MotorError, OSError)
 STATUS_FILE_FRESH_S = 3.0
 STOP_WAIT_S = 5.0
 JOG_MAX_MM = 5.0
+STEPS_MAX = 5000
+LONGEST_STEP_UM = 8.0  # the manual's 5 +- 3 um
 
 
 class UsageError(Exception):
@@ -50,24 +44,21 @@ class CouldNotError(Exception):
     """It was tried and did not work; one line."""
 
 
-# --- the two ways to a bridge -----------------------------------------------------------------
-
-
 @contextlib.contextmanager
 def connected(args: argparse.Namespace, config: BridgeConfig) -> Iterator[BridgeClient]:
     """A client with an open session, to a running bridge or to one inside this process."""
-    opened = _bridge_inside(config) if args.direct else _bridge_on_the_line(args, config)
-    with opened as client:
+    with contextlib.ExitStack() as stack:
+        if args.direct:
+            client = stack.enter_context(sessions.bridge_inside(config))
+        else:
+            client = _client_on_the_line(args, config)
         try:
             client.open(args.timeout)
+            if args.at:
+                _declare(client, args.at, args.by)
             yield client
         finally:
             client.close()
-
-
-@contextlib.contextmanager
-def _bridge_on_the_line(args: argparse.Namespace, config: BridgeConfig) -> Iterator[BridgeClient]:
-    yield _client_on_the_line(args, config)
 
 
 def _client_on_the_line(args: argparse.Namespace, config: BridgeConfig) -> BridgeClient:
@@ -77,52 +68,7 @@ def _client_on_the_line(args: argparse.Namespace, config: BridgeConfig) -> Bridg
             f"{args.config}: bridge.service_link: is missing; name the line with --link, "
             "or talk to the motors with --direct"
         )
-    return BridgeClient(
-        url,
-        name="engineer",
-        baud=config.link_baud,
-        heartbeat_s=config.heartbeat_s,
-        deadman_s=config.deadman_s,
-    )
-
-
-@contextlib.contextmanager
-def _bridge_inside(config: BridgeConfig) -> Iterator[BridgeClient]:
-    guardian = make_guardian(config) if config.guardian else None
-    near, far = socket.socketpair()
-    journal = Journal(config.state_dir)
-    motors = make_motors(config)
-    try:
-        motors.open()
-        daemon = Daemon(
-            config,
-            motors,
-            journal,
-            guardian=guardian,
-            open_transport=lambda: DescriptorTransport(far),
-        )
-    except BaseException:
-        with contextlib.suppress(MotorError):
-            motors.stop()
-        motors.close()
-        journal.close()
-        if guardian is not None:
-            guardian.dismiss()
-        raise
-    thread = threading.Thread(target=daemon.run, name="bridge")
-    thread.start()
-    try:
-        yield BridgeClient(
-            "--direct",
-            name="engineer",
-            heartbeat_s=config.heartbeat_s,
-            deadman_s=config.deadman_s,
-            open_transport=lambda: DescriptorTransport(near),
-        )
-    finally:
-        daemon.leave("engineer's command done")
-        thread.join()
-        near.close()
+    return sessions.client_on_the_line(config, url)
 
 
 # --- commands ---------------------------------------------------------------------------------
@@ -175,9 +121,7 @@ def _print(args: argparse.Namespace, fields: dict[str, object]) -> None:
 
 
 def jog(args: argparse.Namespace, config: BridgeConfig) -> None:
-    axes = {axis.name: axis for axis in config.axes}
-    if args.axis not in axes:
-        raise UsageError(f"axis {args.axis!r} is not one of {', '.join(axes)}")
+    _axis_named(config, args.axis)
     if not 0 < abs(args.mm) <= JOG_MAX_MM:  # NaN fails this too
         raise UsageError(f"a jog is more than 0 and at most {JOG_MAX_MM} mm, not {args.mm}")
     with connected(args, config) as client:
@@ -241,6 +185,7 @@ def _report(args: argparse.Namespace, outcome: MoveOutcome) -> None:
 def stop(args: argparse.Namespace, config: BridgeConfig) -> None:
     if args.direct:
         _stop_directly(config)
+        _print(args, {"stopped": True})
         return
     client = _client_on_the_line(args, config)
     client.request_stop(emergency=args.emergency)  # before anything else, session or not
@@ -283,14 +228,19 @@ def rearm(args: argparse.Namespace, config: BridgeConfig) -> None:
 
 def declare(args: argparse.Namespace, config: BridgeConfig) -> None:
     with connected(args, config) as client:
-        positions_um = dict(client.status.positions_um)
-        for text in args.positions:
-            axis, _, mm = text.partition("=")
-            if axis not in positions_um:
-                raise UsageError(f"{text!r}: {axis!r} is not one of {', '.join(positions_um)}")
-            positions_um[axis] = _um_from_text(text, mm)
-        client.declare_position(positions_um, args.by)
+        _declare(client, args.positions, args.by)
         _print(args, _status_fields(client.status))
+
+
+def _declare(client: BridgeClient, texts: Sequence[str], by: str) -> None:
+    """Texts like "xt=1.5"; axes that are not named stand where they say."""
+    positions_um = dict(client.status.positions_um)
+    for text in texts:
+        axis, _, mm = text.partition("=")
+        if axis not in positions_um:
+            raise UsageError(f"{text!r}: {axis!r} is not one of {', '.join(positions_um)}")
+        positions_um[axis] = _um_from_text(text, mm)
+    client.declare_position(positions_um, by)
 
 
 def _um_from_text(text: str, mm: str) -> int:
@@ -303,53 +253,62 @@ def _um_from_text(text: str, mm: str) -> int:
     return round(value * 1000)
 
 
-def calibrate_steps(args: argparse.Namespace, config: BridgeConfig) -> None:
-    if not args.direct:
-        raise UsageError("calibrate-steps runs the motor in open loop: it needs --direct")
-    wanted = [axis for axis in config.axes if axis.name == args.axis]
-    if not wanted:
-        names = ", ".join(axis.name for axis in config.axes)
-        raise UsageError(f"axis {args.axis!r} is not one of {names}")
-    _confirm(args, f"run {args.axis} {args.runs} times {args.steps} steps forward and back")
-    guardian = make_guardian(config) if config.guardian else None
-    try:
-        measured = step_calibration.calibrate_steps(
-            config, wanted[0], steps=args.steps, runs=args.runs, measure_mm=_ask_for_mm
-        )
-    finally:
-        if guardian is not None:
-            guardian.dismiss()
+def measure_steps(args: argparse.Namespace, config: BridgeConfig) -> None:
+    """Run one axis in open loop there and back; print the lines for the room's file."""
+    _require_direct(args, "runs the motor in open loop")
+    axis = _axis_named(config, args.axis)
+    if not (1 <= args.steps <= STEPS_MAX and 2 <= args.runs <= 50):
+        raise UsageError(f"--steps is 1 to {STEPS_MAX}, --runs 2 to 50")
+    _confirm(args, f"run {axis.name} {args.runs} times {args.steps} steps forward and back")
+    with sessions.bench(config) as (motors, journal):
+        if journal.insertion_locked:
+            raise CouldNotError("refused, insertion_locked: the needle may be in")
+        if journal.stop.latched:
+            raise CouldNotError(f"refused, stop_latched: stop {journal.stop.number}; re-arm first")
+        read_um = None if axis.drive == "closed_loop" else _ask_for_um
+        if read_um is None:
+            _check_room_for(axis, motors.measure_um(axis.name), args.steps)
+        measured = calibrate_steps(motors, axis, steps=args.steps, runs=args.runs, read_um=read_um)
     _print(args, measured.as_fields())
 
 
-def _ask_for_mm(what: str) -> float:
+def _check_room_for(axis: AxisConfig, here_um: float, steps: int) -> None:
+    reach_um = steps * LONGEST_STEP_UM
+    if not axis.travel_min_um + reach_um <= here_um <= axis.travel_max_um - reach_um:
+        raise CouldNotError(
+            f"refused, beyond_travel: axis {axis.name} is at {here_um:.0f} um; {steps} steps of up "
+            f"to {LONGEST_STEP_UM:g} um could leave {axis.travel_min_um}..{axis.travel_max_um} um"
+        )
+
+
+def _axis_named(config: BridgeConfig, name: str) -> AxisConfig:
+    for axis in config.axes:
+        if axis.name == name:
+            return axis
+    raise UsageError(f"axis {name!r} is not one of {', '.join(a.name for a in config.axes)}")
+
+
+def _require_direct(args: argparse.Namespace, why: str) -> None:
+    if not args.direct:
+        raise UsageError(f"{args.command} {why}: it needs --direct, and no bridge running")
+
+
+def _ask_for_um(what: str) -> float:
     if not sys.stdin.isatty():
-        raise UsageError("an open-loop axis is measured by you: run it on a terminal")
+        raise UsageError("an axis without encoder is measured by you: run this on a terminal")
     while True:
-        try:
-            return float(input(f"{what}: gauge reading in mm: "))
-        except ValueError:
-            print("a number, please")
+        with contextlib.suppress(ValueError):
+            return float(input(f"{what}: gauge reading along the axis, mm: ")) * 1000.0
 
 
 def capture(args: argparse.Namespace, config: BridgeConfig) -> None:
     """Write every byte of the controllers' lines to a file while polling them."""
-    if not args.direct:
-        raise UsageError(
-            "capture listens at the controllers: it needs --direct (a running bridge writes its "
-            "own capture to bridge.capture_file)"
-        )
-    motors = step_calibration.motors_with_capture(config, args.file)
-    journal = Journal(config.state_dir)  # nobody else may be talking to them
-    try:
-        motors.open()
+    _require_direct(args, "listens at the controllers (a bridge writes to bridge.capture_file)")
+    with sessions.bench(config, capture_file=args.file) as (motors, _journal):
         until_s = time.monotonic() + args.seconds
         while time.monotonic() < until_s:
             motors.poll()
             time.sleep(0.02)
-    finally:
-        motors.close()
-        journal.close()
     print(f"captured {args.seconds:g} s to {args.file}")
 
 
@@ -364,6 +323,9 @@ def _parser() -> argparse.ArgumentParser:
     where.add_argument("--direct", action="store_true", help="straight at the controllers")
     parser.add_argument("--by", default=_user(), help="who does this (default: the user)")
     parser.add_argument("--yes", action="store_true", help="move without asking")
+    parser.add_argument(
+        "--at", action="append", metavar="AXIS=MM", help="first declare that an axis stands here"
+    )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--timeout", type=float, default=8.0, help="seconds to find the bridge")
     commands = parser.add_subparsers(dest="command", required=True)
@@ -384,7 +346,7 @@ def _parser() -> argparse.ArgumentParser:
     add.add_argument("axis")
     add.add_argument("--steps", type=int, default=200)
     add.add_argument("--runs", type=int, default=3)
-    add.set_defaults(do=calibrate_steps)
+    add.set_defaults(do=measure_steps)
     add = commands.add_parser("capture", help="write the controllers' bytes to a file")
     add.add_argument("file", type=Path)
     add.add_argument("--seconds", type=float, default=10.0)
@@ -409,7 +371,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return _fail(error, EXIT_BAD_INPUT)
     except RefusedError as error:
         return _fail(f"refused, {error}", EXIT_COULD_NOT)
-    except (BridgeError, CouldNotError, JournalError, MotorError, OSError) as error:
+    except (BridgeError, CouldNotError, *COULD_NOT) as error:
         return _fail(error, EXIT_COULD_NOT)
     except KeyboardInterrupt:
         return _fail("interrupted; STOP was sent", EXIT_COULD_NOT)

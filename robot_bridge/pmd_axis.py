@@ -35,6 +35,7 @@ POLL_PAUSE_S = 0.01
 MIN_SPEED_HZ = 10
 RAMP_DOWN_HZ_PER_MS = 10
 AVOID_OVERSHOOT = 3
+NO_ENCODER = 0
 STALL_WINDOW_S = 0.5
 RUNAWAY_MARGIN_UM = 100.0
 # The response delay (Y44) returns to 20 us at every power-on and is not kept in flash: other
@@ -233,6 +234,12 @@ class PmdAxis:
                     12: AVOID_OVERSHOOT,
                 }
             )
+        else:
+            # No encoder, at count 0 between limits at 0: no target command, meant or made of
+            # another one by a wrong bit, can move the motor.
+            yield from self._set_all({13: NO_ENCODER})
+            yield Command(self.address, "E0", reads=False)
+            yield from self._set_all({3: 0, 4: 0})
         yield from self._read_speed_cap(model_max_hz)
 
     def _read_speed_cap(self, model_max_hz: int) -> Steps[None]:
@@ -318,7 +325,7 @@ class PmdAxis:
                 raise self._error("stopped", f"left target mode {error_um:.0f} um short")
             watch.check(error_um, self._clock())
         yield pmd_protocol.stop(self.address)
-        yield pmd_protocol.clear_stored(self.address)
+        yield pmd_protocol.overwrite_stored(self.address)
         yield from self._read_position_surely()
 
     @property
@@ -349,7 +356,7 @@ class PmdAxis:
                 )
             self.position_um = run.from_um + pmd_units.um_from_microsteps(self.config, microsteps)
             self._run = None
-            yield pmd_protocol.clear_stored(self.address)
+            yield pmd_protocol.overwrite_stored(self.address)
         finally:
             if self._run is not None:  # stopped, failed or given up
                 self.position_um = self._estimate_um(run)
@@ -431,9 +438,9 @@ class PmdAxis:
             yield from self._read_position()
             if abs(self.position_um - position_um) > self._arrival_um:
                 raise self._error("setting", f"reads {self.position_um:.0f} um after E{count}")
+            yield from self._set_all({44: DECLARED_DELAY_US})
         else:
             self.position_um = float(position_um)
-        yield from self._set_all({44: DECLARED_DELAY_US})
         self._at_rest_um = self.position_um
         self.certain = True
         self.fault = None

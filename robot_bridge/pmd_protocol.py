@@ -132,8 +132,12 @@ def run_stored(command: Command) -> Command:
     return Command(command.address, "B1", reads=False, repeatable=command.repeatable)
 
 
-def clear_stored(address: int) -> Command:
-    return Command(address, "B0", reads=False)
+def overwrite_stored(address: int) -> Command:
+    """A harmless question takes the place of a stored motion.
+
+    Not `B0`, which would clear it: one wrong bit makes `B1` of that, and the motion runs again.
+    """
+    return Command(address, "Eb", reads=False)
 
 
 def _checked_speed(speed_hz: int) -> int:

@@ -40,6 +40,7 @@ class CalibrationArguments:
     gate_sigma: float
     repeatability_mm: float
     scale_error: float
+    method: str = "ml"
 
     @property
     def noise(self) -> MotionNoise:
@@ -85,7 +86,7 @@ def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
             _check(jacobian)
         moved = yield from move(MoveTo(setpoints_um, f"calibration {number + 1}/{len(places)}"))
         expectation = _expectation(before, moved.readback_um, jacobian, arguments, number)
-        _, measured = yield from measure_here("ml", expectation)
+        _, measured = yield from measure_here(arguments.method, expectation)
         plane = _checked_plane(plane, measured)
         here = estimate_from(measured, moved.readback_um)
         if before is not None:
@@ -168,7 +169,13 @@ def _refine(
     if len(arguments.shifts_px) > 1:
         expectation = Expectation.of(estimate, arguments.position_gate_mm, arguments.gate_sigma)
         found = yield from measure_shift_set(
-            estimate, arguments.shifts_px, jacobian, plane, "ml", expectation, arguments.noise
+            estimate,
+            arguments.shifts_px,
+            jacobian,
+            plane,
+            arguments.method,
+            expectation,
+            arguments.noise,
         )
         # all that was known before has been through the same moves: nothing to add
         estimate, measurement_id = found.estimate, found.measured.measurement_id

@@ -247,7 +247,7 @@ class Execution:
         imaging = self._config.imaging
         radius_mm = (imaging.fiducial_radius_min_mm, imaging.fiducial_radius_max_mm)
         hold_ids = [h.hold_id for h in step.holds]
-        request = measure_request(step, radius_mm)
+        request = measure_request(step, radius_mm, imaging.start_region_px)
         number = self._record.request_measurement(step.method, hold_ids, request)
         self.prompt = "Localizing the fiducial."
         while (measurement := self._record.measurement(number)).state == "requested":

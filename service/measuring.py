@@ -10,8 +10,15 @@ import numpy as np
 from service.steps import Measure, Measured
 
 
-def measure_request(step: Measure, radius_mm: tuple[float, float]) -> dict[str, Any]:
-    """What the record keeps of a Measure step, for the worker (`sr_engine.worker`)."""
+def measure_request(
+    step: Measure,
+    radius_mm: tuple[float, float],
+    region_px: tuple[float, float, float, float] | None = None,
+) -> dict[str, Any]:
+    """What the record keeps of a Measure step, for the worker (`sr_engine.worker`).
+
+    region_px: where to look while nothing is known of the fiducial's place.
+    """
     expected = step.expected_plane_mm
     return {
         "holds": [{"hold_id": h.hold_id, "shift_mm": list(h.shift_mm)} for h in step.holds],
@@ -19,6 +26,7 @@ def measure_request(step: Measure, radius_mm: tuple[float, float]) -> dict[str, 
         "gate_mm": step.gate_mm,
         "shift_sigma_mm": step.shift_sigma_mm,
         "radius_mm": list(radius_mm),
+        "region_px": None if region_px is None else list(region_px),
     }
 
 

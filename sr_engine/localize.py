@@ -105,6 +105,8 @@ def localize(
       May be left out for one frame.
     start_px: where the object is in the reference pose, to within 3 px; else it is looked for.
     radius_px: (low, high), or one number within 25 %; default 1.5 to 12 px.
+    method: "ml", or one of the paper's, "sr", "bicubic", "base" (see `paper`), which heed
+      start_px, radius_px, gate_px and saturation_level alone.
     psf: point spread; default flat k-space. noise: "rician", or "gaussian" (default for a psf
       that folds, a camera). sigma: noise std per channel where known.
     shift_sigma_px: std per axis of a frame's shift (the motor's repeatability).
@@ -113,8 +115,16 @@ def localize(
 
     Raises a subclass of EngineError; never returns a centre that it does not stand for.
     """
+    if method in ("base", "bicubic", "sr"):
+        # Loaded here: the paper's methods answer with this module's Localization.
+        from sr_engine.paper import localize_paper
+
+        return localize_paper(
+            frames, shifts_px, method, start_px=start_px, radius_px=radius_px, gate_px=gate_px,
+            saturation_level=saturation_level,
+        )  # fmt: skip
     if method != "ml":
-        raise ParameterError(f"unknown method '{method}' here, known: ml")
+        raise ParameterError(f"unknown method '{method}', known: ml, sr, bicubic, base")
     stack = checked_frames(frames)
     shifts = checked_shifts(shifts_px, len(stack))
     radii = checked_radii(radius_px) or DEFAULT_RADII_PX

@@ -6,8 +6,9 @@ is recorded as failed, with the reason.
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, cast, get_args
@@ -22,11 +23,17 @@ from case_record.rows import Measurement, SliceRow
 from dicom_listener.pixels import magnitude_pixels
 from dicom_listener.reasons import UnusableError
 from room_config.load import Config
-from sr_engine.errors import EngineError, OutsideGateError, SingularShiftSetError
+from sr_engine.errors import (
+    EngineError,
+    ObjectAtBorderError,
+    OutsideGateError,
+    SingularShiftSetError,
+)
 from sr_engine.geometry import SliceGeometry
 from sr_engine.hough import HoughSettings
 from sr_engine.localize import SEARCH_PX, Localization, localize
 from sr_engine.paper import PaperMethod, PaperSettings, localize_paper
+from sr_engine.psf import Psf
 from sr_engine.reconstruct import reconstruct
 
 IMAGES = "images"
@@ -175,51 +182,97 @@ def _code_of(error: EngineError | UnusableSlicesError | UnusableError) -> str:
     return str(error.reason)
 
 
-def localize_request(frames: Frames, method: str, request: Mapping[str, Any]) -> Localization:
+def localize_request(
+    frames: Frames, method: str, request: Mapping[str, Any], psf: Psf | None = None
+) -> Localization:
     """Localize the fiducial where it is expected, or anywhere if nothing is known of its place.
 
-    request: radius_mm (low, high), expected_plane_mm and gate_mm (both None: look everywhere),
-    shift_sigma_mm (standard deviation of a commanded shift, one axis). Raises an EngineError.
+    request: radius_mm (low, high); expected_plane_mm and gate_mm (both None: not known);
+    region_px (r0, c0, r1, c1), where to look then (None: the whole slice); shift_sigma_mm
+    (standard deviation of a commanded shift, one axis). Raises an EngineError.
     """
     spacing = np.array(frames.geometry.spacing_mm)
     mean_mm = float(np.mean(spacing))
     low_mm, high_mm = request["radius_mm"]
-    expected_px = gate_px = None
-    if request["expected_plane_mm"] is not None:
-        expected_mm = np.array(request["expected_plane_mm"])
-        expected_px = (expected_mm - _plane_origin_mm(frames.geometry)) / spacing
-        gate_px = float(request["gate_mm"]) / mean_mm
-    # an expectation that is wider than the engine's own search only serves to refuse
-    near = gate_px is not None and gate_px <= SEARCH_PX
     radius_px = (low_mm / mean_mm, high_mm / mean_mm)
-    start_px, start_gate_px = (expected_px, gate_px) if near else (None, None)
+    if request["expected_plane_mm"] is None:
+        start_px = _start_anywhere(frames, method, radius_px, request.get("region_px"))
+        return _localize_by(method, frames, start_px, radius_px, request, psf)
+    expected_mm = np.array(request["expected_plane_mm"])
+    expected_px = (expected_mm - _plane_origin_mm(frames.geometry)) / spacing
+    gate_px = float(request["gate_mm"]) / mean_mm
+    start_px = expected_px
+    if gate_px > SEARCH_PX:  # the engine looks no further than that from a start
+        reach = gate_px + 2 * radius_px[1]
+        region = (*(expected_px - reach), *(expected_px + reach))
+        start_px = _start_in_region(frames, radius_px, region)
+    found = _localize_by(method, frames, start_px, radius_px, request, psf)
+    miss_px = float(np.linalg.norm(np.asarray(found.centre_px) - expected_px))
+    if not miss_px <= gate_px:
+        raise OutsideGateError(
+            f"the round object found is {miss_px * mean_mm:.1f} mm from where the fiducial is "
+            f"expected; at most {gate_px * mean_mm:.1f} mm are believed"
+        )
+    return found
+
+
+def _localize_by(
+    method: str,
+    frames: Frames,
+    start_px: NDArray[np.float64] | None,
+    radius_px: tuple[float, float],
+    request: Mapping[str, Any],
+    psf: Psf | None,
+) -> Localization:
     if method in get_args(PaperMethod):
-        found = localize_paper(
+        return localize_paper(
             frames.pixels,
             frames.shifts_px,
             cast(PaperMethod, method),
             start_px=start_px,
-            gate_px=start_gate_px,
             settings=PaperSettings(HoughSettings(radius_px)),
         )
-    else:
-        found = localize(
-            frames.pixels,
-            frames.shifts_px,
-            start_px=start_px,
-            gate_px=start_gate_px,
-            radius_px=radius_px,
-            method=method,
-            shift_sigma_px=float(request.get("shift_sigma_mm", 0.0)) / mean_mm,
+    mean_mm = float(np.mean(frames.geometry.spacing_mm))
+    return localize(
+        frames.pixels,
+        frames.shifts_px,
+        start_px=start_px,
+        radius_px=radius_px,
+        method=method,
+        psf=psf,
+        shift_sigma_px=float(request.get("shift_sigma_mm", 0.0)) / mean_mm,
+    )
+
+
+def _start_anywhere(
+    frames: Frames,
+    method: str,
+    radius_px: tuple[float, float],
+    region_px: Sequence[float] | None,
+) -> NDArray[np.float64] | None:
+    """None where the method's own search over the whole slice serves."""
+    if region_px is not None:
+        return _start_in_region(frames, radius_px, region_px)
+    if method in get_args(PaperMethod):  # a circle transform takes any edge that is round
+        rows, cols = frames.geometry.shape
+        return _start_in_region(frames, radius_px, (0, 0, rows, cols))
+    return None
+
+
+def _start_in_region(
+    frames: Frames, radius_px: tuple[float, float], region_px: Sequence[float]
+) -> NDArray[np.float64]:
+    """The one round object of the first frame that lies in the region, in the reference pose."""
+    rows, cols = frames.geometry.shape
+    r0, c0 = (max(0, math.floor(value)) for value in region_px[:2])
+    r1, c1 = min(rows, math.ceil(region_px[2]) + 1), min(cols, math.ceil(region_px[3]) + 1)
+    if r1 <= r0 or c1 <= c0:
+        raise ObjectAtBorderError(
+            f"rows {r0} to {r1}, columns {c0} to {c1}, where the fiducial is looked for, lie "
+            f"outside of the {rows} x {cols} slice"
         )
-    if expected_px is not None and gate_px is not None and not near:
-        miss_px = float(np.linalg.norm(np.asarray(found.centre_px) - expected_px))
-        if not miss_px <= gate_px:
-            raise OutsideGateError(
-                f"the round object found is {miss_px * mean_mm:.1f} mm from where the fiducial is "
-                f"expected; at most {gate_px * mean_mm:.1f} mm are believed"
-            )
-    return found
+    found = localize(frames.pixels[0, r0:r1, c0:c1], radius_px=radius_px)
+    return np.asarray(found.centre_px) + np.array([r0, c0]) - frames.shifts_px[0]
 
 
 def _plane_origin_mm(geometry: SliceGeometry) -> NDArray[np.float64]:

@@ -45,7 +45,7 @@ class StudyPoint:
     scene: str = "drawn"
     radius_px: float = 4.0
     snr: float = 20.0
-    blur_sigma_px: float = 0.3
+    blur_sigma_px: float = 0.2
     sensitivity: float = 0.85
     shift_set: str = "paper"
     seed: int = 1

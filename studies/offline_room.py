@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -32,12 +32,14 @@ from service.steps import (
     ProcedureSteps,
     Step,
 )
+from simulator.camera import Camera, photograph
 from simulator.config import VirtualRoom
-from simulator.mr_slice import acquire
+from simulator.mr_slice import acquire, slice_geometry
 from simulator.scene import true_fiducial_mm
 from simulator.stage_physics import PiezoLegsStage, StageParameters
 from sr_engine.errors import EngineError
 from sr_engine.geometry import SliceGeometry
+from sr_engine.psf import Psf
 from sr_engine.worker import Frames, describe_result, localize_request
 
 Array = NDArray[np.float64]
@@ -55,9 +57,20 @@ class SeenSlice:
 
 
 class Imaging(Protocol):
-    """A scanner or a camera: looks at the room, and knows where the fiducial truly is."""
+    """A scanner or a camera: looks at the room, and knows where the fiducial truly is.
 
-    frame_s: float
+    frame_s: what one image costs; psf: its point spread, None for the engine's
+    default; model_sigma_px: how far that may mislead the maximum-likelihood fit, per axis.
+    """
+
+    @property
+    def frame_s(self) -> float: ...
+
+    @property
+    def psf(self) -> Psf | None: ...
+
+    @property
+    def model_sigma_px(self) -> float: ...
 
     def look(
         self, stage_mm: Mapping[str, float], rng: np.random.Generator
@@ -74,6 +87,8 @@ class MrImaging:
 
     room: VirtualRoom
     frame_s: float = 150.0
+    psf: Psf | None = None
+    model_sigma_px: float = 0.0
 
     def look(
         self, stage_mm: Mapping[str, float], rng: np.random.Generator
@@ -82,8 +97,32 @@ class MrImaging:
         return taken.magnitude, taken.geometry
 
     def true_plane_mm(self, stage_mm: Mapping[str, float]) -> Array:
-        geometry = acquire(self.room, stage_mm, np.random.default_rng(0)).geometry
-        return plane_of(geometry).from_patient(true_fiducial_mm(self.room, stage_mm).tolist())
+        return _true_plane_mm(self.room, stage_mm)
+
+
+@dataclass(frozen=True)
+class CameraImaging:
+    """The benchtop camera over the same stages."""
+
+    room: VirtualRoom
+    camera: Camera = Camera()
+    frame_s: float = 27.6
+    # what comes nearest to the camera's pixel and the interpolation together, and what it misses
+    psf: Psf | None = Psf("gaussian", (0.3,))
+    model_sigma_px: float = 0.022
+
+    def look(
+        self, stage_mm: Mapping[str, float], rng: np.random.Generator
+    ) -> tuple[Array, SliceGeometry]:
+        return photograph(self.room, stage_mm, self.camera, rng)
+
+    def true_plane_mm(self, stage_mm: Mapping[str, float]) -> Array:
+        return _true_plane_mm(self.room, stage_mm)
+
+
+def _true_plane_mm(room: VirtualRoom, stage_mm: Mapping[str, float]) -> Array:
+    plane = plane_of(slice_geometry(room.protocol))
+    return plane.from_patient(true_fiducial_mm(room, stage_mm).tolist())
 
 
 class OfflineRoom:
@@ -209,9 +248,13 @@ class OfflineRoom:
             tuple(one.row for one, _ in taken),
         )
         try:
-            found = localize_request(frames, step.method, measure_request(step, self._radius_mm))
+            request = measure_request(step, self._radius_mm)
+            found = localize_request(frames, step.method, request, self.imaging.psf)
         except EngineError as error:
             return Measured(self._measurements, error.reason, str(error))
+        if step.method == "ml":
+            doubt = np.eye(2) * self.imaging.model_sigma_px**2
+            found = replace(found, covariance_px2=found.covariance_px2 + doubt)
         return measured_from_result(self._measurements, describe_result(frames, found))
 
 

@@ -21,21 +21,26 @@ def fields(ended: subprocess.CompletedProcess[str]) -> dict:
     return json.loads(ended.stdout)
 
 
-@pytest.mark.parametrize("link", [True, False], ids=["link", "direct"])
-def test_declare_then_jog_moves_one_axis_by_the_asked_distance(tmp_path: Path, link: bool):
+def test_declare_then_jog_moves_one_axis_by_the_asked_distance(tmp_path: Path):
     with bridge_room(tmp_path) as room:
-        if link:
-            room.start_daemon()
-        declared = fields(robot(room, "declare", *[f"{axis}=0" for axis in AXES], link=link))
-        assert declared["position_certain"] or not link  # a direct bridge ends with the command
-        if not link:
-            return
-        ended = robot(room, "--yes", "jog", "xt", "-1.25", link=link)
-        assert fields(ended)["state"] == "DONE"
+        room.start_daemon()
+        declared = fields(robot(room, "declare", *[f"{axis}=0" for axis in AXES]))
+        assert declared["position_certain"]
+        assert fields(robot(room, "--yes", "jog", "xt", "-1.25"))["state"] == "DONE"
         truth = room.controllers.positions_um()
         assert truth["xt"] == pytest.approx(-1250, abs=20)
         assert truth["yt"] == pytest.approx(0, abs=20)
-        assert fields(robot(room, "status", link=link))["armed"] is False
+        assert fields(robot(room, "status"))["armed"] is False
+
+
+def test_a_direct_jog_needs_no_daemon_and_keeps_the_journal(tmp_path: Path):
+    with bridge_room(tmp_path) as room:
+        at = ["--at", "xt=0", "--yes"]
+        assert fields(robot(room, *at, "jog", "xt", "2", link=False))["state"] == "DONE"
+        assert room.controllers.positions_um()["xt"] == pytest.approx(2000, abs=20)
+        journal = (tmp_path / "state" / "bridge_journal.jsonl").read_text()
+        assert "engineer-jog" in journal
+        assert fields(robot(room, "stop", link=False)) == {"stopped": True}
 
 
 def test_jog_keeps_the_bridges_checks(tmp_path: Path):

@@ -12,7 +12,7 @@ import pytest
 from neighbours import Page, Receiver, Running, Stages, Start
 
 from simulator.config import parse_virtual_room
-from simulator.scanner import operate
+from simulator.scan_operator import operate
 
 
 @pytest.fixture

@@ -16,7 +16,7 @@ import serial
 from neighbours import Page, Receiver
 
 from simulator.config import parse_virtual_room
-from simulator.scanner import operate
+from simulator.scan_operator import operate
 from simulator.scene import true_fiducial_mm
 from simulator.truth_client import TruthAddress, TruthError, ask_path, ask_where
 

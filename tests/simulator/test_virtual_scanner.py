@@ -18,7 +18,7 @@ from pydicom import dcmread
 
 from simulator.config import VirtualRoom, VirtualRoomError
 from simulator.mr_slice import acquire
-from simulator.scanner import operate
+from simulator.scan_operator import operate
 from simulator.scene import true_fiducial_mm
 from sr_engine.geometry import SliceGeometry
 
