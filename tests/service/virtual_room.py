@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -42,6 +43,11 @@ class AttendedRoom(DemoRoom):
         self.family.children[name].end()
         words = autospine(name, "--config", str(self.folder / "room.toml"))
         self.family.start(name, words)
+
+    def start_bridge_again(self) -> None:
+        self.family.children["bridge"].end()
+        here = ["--config", str(self.folder / "room.toml")]
+        self.family.launch("bridge", [sys.executable, "-m", "robot_bridge", *here])
 
     def standstill_s(self, from_s: float, until_s: float) -> float:
         """The instant of the last motion of any stage, as the motors know it."""
