@@ -66,6 +66,8 @@ class CaseRecord:
         self._db.execute("PRAGMA journal_mode = WAL")
         self._db.execute("PRAGMA synchronous = FULL")
         self._db.execute("PRAGMA foreign_keys = ON")
+        if self._db.execute("PRAGMA user_version").fetchone()[0] == SCHEMA_VERSION:
+            return  # the usual case: who only reads does not wait for a writer
         with self.transaction():
             version = self._db.execute("PRAGMA user_version").fetchone()[0]
             if version > SCHEMA_VERSION:
@@ -105,6 +107,10 @@ class CaseRecord:
     def data_version(self) -> int:
         """A number that changes when another connection has committed something."""
         return int(self._db.execute("PRAGMA data_version").fetchone()[0])
+
+    def change_count(self) -> tuple[int, int]:
+        """As `data_version`, and a number that also changes with what this connection wrote."""
+        return self.data_version(), self._db.total_changes
 
     # The case itself
 
@@ -149,6 +155,22 @@ class CaseRecord:
     def events(self, after_id: int = 0, limit: int = 1000) -> list[Event]:
         rows = self._db.execute(
             "SELECT * FROM event WHERE event_id > ? ORDER BY event_id LIMIT ?", (after_id, limit)
+        )
+        return [Event(**{**row, "body": json.loads(row["body"])}) for row in map(dict, rows)]
+
+    def newest_events(self, limit: int, before_id: int | None = None) -> list[Event]:
+        """Return the newest events (before one of them), newest first."""
+        rows = self._db.execute(
+            "SELECT * FROM event WHERE event_id < ? ORDER BY event_id DESC LIMIT ?",
+            (before_id if before_id is not None else 2**62, limit),
+        )
+        return [Event(**{**row, "body": json.loads(row["body"])}) for row in map(dict, rows)]
+
+    def events_of_kind(self, kind: str, after_id: int = 0) -> list[Event]:
+        """Return all events of a kind, oldest first."""
+        rows = self._db.execute(
+            "SELECT * FROM event WHERE kind = ? AND event_id > ? ORDER BY event_id",
+            (kind, after_id),
         )
         return [Event(**{**row, "body": json.loads(row["body"])}) for row in map(dict, rows)]
 
@@ -313,6 +335,19 @@ class CaseRecord:
         ).fetchone()
         return _slice(row) if row else None
 
+    def page_of_slices(
+        self, *, after_id: int, limit: int, newest: bool, state: str | None
+    ) -> list[SliceRow]:
+        """Return slices in pages by id: upwards from `after_id`, or the newest ones first."""
+        order = "DESC" if newest else "ASC"
+        beyond = "slice_id < ?2" if newest and after_id else "slice_id > ?2"
+        rows = self._db.execute(
+            "SELECT * FROM slice WHERE (?1 IS NULL OR state = ?1)"
+            f" AND {beyond} ORDER BY slice_id {order} LIMIT ?3",
+            (state, after_id, limit),
+        )
+        return [_slice(row) for row in rows]
+
     def count_slices_after(self, slice_id: int, state: str) -> int:
         row = self._db.execute(
             "SELECT COUNT(*) FROM slice WHERE slice_id > ? AND state = ?", (slice_id, state)
@@ -380,6 +415,16 @@ class CaseRecord:
         )
         return [_measurement(row) for row in rows]
 
+    def page_of_measurements(self, *, after_id: int, limit: int, newest: bool) -> list[Measurement]:
+        """Return measurements in pages by id: upwards from `after_id`, or the newest ones first."""
+        order = "DESC" if newest else "ASC"
+        beyond = "measurement_id < ?1" if newest and after_id else "measurement_id > ?1"
+        rows = self._db.execute(
+            f"SELECT * FROM measurement WHERE {beyond} ORDER BY measurement_id {order} LIMIT ?2",
+            (after_id, limit),
+        )
+        return [_measurement(row) for row in rows]
+
     # Procedures and their steps
 
     def begin_procedure(self, name: str, arguments: Mapping[str, Any]) -> int:
@@ -404,6 +449,12 @@ class CaseRecord:
             "SELECT * FROM procedure WHERE name = ? AND state = ?"
             " ORDER BY procedure_id DESC LIMIT 1",
             (name, state),
+        ).fetchone()
+        return _procedure(row) if row else None
+
+    def last_ended_procedure(self) -> Procedure | None:
+        row = self._db.execute(
+            "SELECT * FROM procedure WHERE state != 'running' ORDER BY procedure_id DESC LIMIT 1"
         ).fetchone()
         return _procedure(row) if row else None
 

@@ -46,7 +46,6 @@ def _write(folder: Path) -> Result:
             began_s = time.perf_counter()
             path = inbox.store(data_set, envelope)
             took_ms = (time.perf_counter() - began_s) * 1e3
-            inbox.close()
             whole = is_whole(path)
     except OSError as error:
         return "write", False, f"{folder}: {error}"
@@ -66,7 +65,6 @@ def _echo(config: Config) -> Result:
     """Serve on the configured port and send ourselves a C-ECHO."""
     with tempfile.TemporaryDirectory() as place, ExitStack() as stack:
         inbox = Inbox(Path(place))
-        stack.callback(inbox.close)
         scp = open_scp(config.listener, inbox, ListenerMetrics(), lambda path: None)
         scp.start()
         stack.callback(scp.stop)

@@ -2,7 +2,8 @@
 
 offset_s = our wall clock - the scanner's clock, at the same instant. A slice is received after its
 acquisition ended, so every one of them gives an upper bound: receipt - end. The promptest of them
-came within `prompt_delay_s` of its end, which gives the lower bound. An explicit sync narrows both.
+came within `prompt_delay_s` of its end, which gives the lower bound. An explicit sync bounds the
+offset before the first slice comes, and replaces what was known when a clock was set.
 
 The smallest lag is kept for as long as the case lasts and never rises by itself: an offset believed
 too small makes acquisitions look earlier than they were, and those are refused, not misplaced.
@@ -15,13 +16,20 @@ from dicom_listener.times import AcquisitionInterval
 
 @dataclass(frozen=True)
 class ClockRules:
-    """prompt_delay_s: the promptest slice of a session is here that soon after its acquisition.
+    """What is taken for granted about a scanner and its network.
 
+    prompt_delay_s: the promptest slice of a session is here that soon after its acquisition.
+    longest_acquisition_s: no acquisition that comes without its duration lasts longer.
+    largest_offset_s: without a sync, a clock further off than this is not believed to be a clock:
+    it is an old slice sent again.
     late_limit_s: a slice that seems to come later than this shows a clock that was set back, or a
-    network that stood still, and nothing can tell which. drift_ppm widens an old sync.
+    network that stood still, and nothing can tell which.
+    drift_ppm: widens a sync as it ages.
     """
 
     prompt_delay_s: float = 3.0
+    longest_acquisition_s: float = 30.0
+    largest_offset_s: float = 600.0
     late_limit_s: float = 120.0
     jump_tolerance_s: float = 0.5
     drift_ppm: float = 50.0
@@ -56,29 +64,53 @@ class OffsetBounds:
 class ScannerClock:
     """What is known of one scanner's clock. Values only; `observe` makes the next one.
 
-    smallest_lag_s: least (receipt - certain end, or start where the end is not certain).
-    smallest_prompt_lag_s: least (receipt - latest possible end), for the lower bound.
+    least_lag_s: least (receipt - end), with the start in place of an end that is not certain: the
+    offset cannot be larger. least_prompt_lag_s: least (receipt - certain end), and
+    least_loose_lag_s: the same over ends that are estimated or assumed: less the prompt delay, the
+    offset cannot be smaller.
     """
 
     sync: Sync | None = None
-    smallest_lag_s: float | None = None
-    smallest_prompt_lag_s: float | None = None
+    least_lag_s: float | None = None
+    least_prompt_lag_s: float | None = None
+    least_loose_lag_s: float | None = None
 
-    def bounds(self, now_s: float, rules: ClockRules) -> OffsetBounds | None:
-        """None while nothing bounds the offset from below."""
-        lows, highs = [], []
-        if self.sync is not None:
-            age_s = abs(now_s - self.sync.at_s)
-            half_s = self.sync.uncertainty_s + age_s * rules.drift_ppm * 1e-6
-            lows.append(self.sync.offset_s - half_s)
-            highs.append(self.sync.offset_s + half_s)
-        if self.smallest_prompt_lag_s is not None:
-            lows.append(self.smallest_prompt_lag_s - rules.prompt_delay_s)
-        if self.smallest_lag_s is not None:
-            highs.append(self.smallest_lag_s)
-        if not lows or not highs:
+    def bounds_for(
+        self, interval: AcquisitionInterval, received_s: float, rules: ClockRules
+    ) -> OffsetBounds | None:
+        """The interval in which the offset lies for this slice; None where evidence contradicts.
+
+        A sync does not raise the lower bound above what the lags alone give, and the slice's own
+        lag always counts: the clock may have gone forward since, by less than a slice takes to get
+        here, and nothing else would show it.
+        """
+        low_s, high_s = self._believed(received_s, rules)
+        lag_s = self.least_prompt_lag_s
+        if lag_s is None:
+            lag_s = self.least_loose_lag_s
+        own_lag_s = received_s - latest_end_s(interval, rules)
+        by_lag_s = (own_lag_s if lag_s is None else min(lag_s, own_lag_s)) - rules.prompt_delay_s
+        low_s = max(low_s, by_lag_s) if self.sync is None else min(low_s, by_lag_s)
+        if self.least_lag_s is not None:
+            high_s = min(high_s, self.least_lag_s)
+        if low_s > high_s + rules.jump_tolerance_s:
             return None
-        return OffsetBounds(min(max(lows), min(highs)), min(highs))
+        return OffsetBounds(min(low_s, high_s), high_s)
+
+    def least_possible_lag_s(self, now_s: float, rules: ClockRules) -> float:
+        """A slice with a smaller lag than this proves that the scanner's clock went forward."""
+        low_s, _ = self._believed(now_s, rules)
+        if self.least_prompt_lag_s is not None:
+            low_s = max(low_s, self.least_prompt_lag_s - rules.prompt_delay_s)
+        return low_s - rules.jump_tolerance_s
+
+    def _believed(self, now_s: float, rules: ClockRules) -> tuple[float, float]:
+        """Bounds of the offset before any slice was seen."""
+        if self.sync is None:
+            return -rules.largest_offset_s, rules.largest_offset_s
+        age_s = abs(now_s - self.sync.at_s)
+        half_s = self.sync.uncertainty_s + age_s * rules.drift_ppm * 1e-6
+        return self.sync.offset_s - half_s, self.sync.offset_s + half_s
 
 
 @dataclass(frozen=True)
@@ -98,35 +130,49 @@ def observe(
     A lag below what the bounds allow is impossible unless the scanner's clock was set forward:
     everything known is dropped, and this slice is the first evidence of the new time.
     """
-    certain_end_s = interval.start_s if _is_uncertain(interval) else interval.end_s
-    assert certain_end_s is not None
-    lag_s = received_s - certain_end_s
-    prompt_lag_s = None if interval.end_s is None else received_s - interval.end_s
-    bounds = clock.bounds(received_s, rules)
-    if bounds is not None and lag_s < bounds.low_s - rules.jump_tolerance_s:
-        fresh = ScannerClock(smallest_lag_s=lag_s, smallest_prompt_lag_s=prompt_lag_s)
-        jumped_s = bounds.low_s - lag_s
-        return Observation(fresh, jump=f"the scanner's clock went forward by {jumped_s:.1f} s")
+    lag_s = received_s - earliest_end_s(interval)
+    least_s = clock.least_possible_lag_s(received_s, rules)
+    if lag_s < least_s:
+        text = f"the scanner's clock is at least {least_s - lag_s:.1f} s ahead of before"
+        return Observation(_seen(ScannerClock(), interval, received_s, rules), jump=text)
     late = ""
-    if bounds is not None and prompt_lag_s is not None:
-        delay_s = prompt_lag_s - bounds.high_s
+    bounds = clock.bounds_for(interval, received_s, rules)
+    if bounds is not None:
+        delay_s = received_s - latest_end_s(interval, rules) - bounds.high_s
         if delay_s > rules.late_limit_s:
             late = f"received {delay_s:.1f} s after the acquisition, or its clock was set back"
-    return Observation(
-        replace(
-            clock,
-            smallest_lag_s=_least(clock.smallest_lag_s, lag_s),
-            smallest_prompt_lag_s=_least(clock.smallest_prompt_lag_s, prompt_lag_s),
-        ),
-        late=late,
+    return Observation(_seen(clock, interval, received_s, rules), late=late)
+
+
+def _seen(
+    clock: ScannerClock, interval: AcquisitionInterval, received_s: float, rules: ClockRules
+) -> ScannerClock:
+    latest_lag_s = received_s - latest_end_s(interval, rules)
+    seen = replace(
+        clock, least_lag_s=_least(clock.least_lag_s, received_s - earliest_end_s(interval))
     )
+    if _is_certain(interval):
+        return replace(seen, least_prompt_lag_s=_least(clock.least_prompt_lag_s, latest_lag_s))
+    return replace(seen, least_loose_lag_s=_least(clock.least_loose_lag_s, latest_lag_s))
 
 
-def _is_uncertain(interval: AcquisitionInterval) -> bool:
-    return interval.end_s is None or interval.estimated
+def earliest_end_s(interval: AcquisitionInterval) -> float:
+    """When it may have ended at the earliest: an estimate may be far too long."""
+    if interval.end_s is None or interval.estimated:
+        return interval.start_s
+    return interval.end_s
 
 
-def _least(known: float | None, new: float | None) -> float | None:
-    if known is None or new is None:
-        return new if known is None else known
-    return min(known, new)
+def latest_end_s(interval: AcquisitionInterval, rules: ClockRules) -> float:
+    """When it may have ended at the latest, where the header does not say: as long as any does."""
+    if interval.end_s is None:
+        return interval.start_s + rules.longest_acquisition_s
+    return interval.end_s
+
+
+def _is_certain(interval: AcquisitionInterval) -> bool:
+    return interval.end_s is not None and not interval.estimated
+
+
+def _least(known: float | None, new: float) -> float:
+    return new if known is None else min(known, new)

@@ -5,6 +5,7 @@ how stands in the file's own meta group (Private Information), so that one fsync
 names are made of our clock, a counter and the hash: no value from the network reaches a path.
 """
 
+import contextlib
 import hashlib
 import itertools
 import json
@@ -67,10 +68,6 @@ class Inbox:
         self._counter = itertools.count()
         self._lock = threading.Lock()
         folder.mkdir(parents=True, exist_ok=True)
-        self._folder_fd = os.open(folder, os.O_RDONLY)
-
-    def close(self) -> None:
-        os.close(self._folder_fd)
 
     def free_bytes(self) -> int:
         return shutil.disk_usage(self.folder).free
@@ -80,22 +77,29 @@ class Inbox:
 
         Raises InboxFullError or InboxError, and then nothing of it is left behind.
         """
-        free = self.free_bytes()
-        if not free - len(data_set) >= self.min_free_bytes:
-            raise InboxFullError(
-                f"disk low: {free // 2**20} MiB free in {self.folder}, "
-                f"{self.min_free_bytes // 2**20} MiB are kept in reserve"
-            )
         final = self.folder / f"{self._next_name()}-{envelope.sha256[:16]}.dcm"
         part = final.with_suffix(".part")
         try:
+            self._check_free(len(data_set))
             _write_synced(part, part10_head(envelope), data_set)
             part.rename(final)
-            os.fsync(self._folder_fd)
+            _sync_folder(self.folder)
+        except InboxFullError:
+            raise
         except OSError as error:
-            part.unlink(missing_ok=True)
-            raise InboxError(f"cannot write {final}: {error.strerror or error}") from error
+            for path in (part, final):
+                with contextlib.suppress(OSError):
+                    path.unlink()
+            raise InboxError(f"cannot write: {error.strerror or error} ({final})") from error
         return final
+
+    def _check_free(self, wanted_bytes: int) -> None:
+        free = self.free_bytes()
+        if not free - wanted_bytes >= self.min_free_bytes:
+            raise InboxFullError(
+                f"disk low: {free // 2**20} MiB free, {self.min_free_bytes // 2**20} MiB are kept "
+                f"in reserve ({self.folder})"
+            )
 
     def discard_unfinished(self) -> int:
         """Remove what a crash left half-written (never answered Success); return how many."""
@@ -119,6 +123,15 @@ def _write_synced(path: Path, *pieces: bytes) -> None:
         remaining = b"".join(pieces)
         while remaining:
             remaining = remaining[os.write(descriptor, remaining) :]
+        os.fsync(descriptor)
+    finally:
+        os.close(descriptor)
+
+
+def _sync_folder(folder: Path) -> None:
+    """Make the names in a folder durable."""
+    descriptor = os.open(folder, os.O_RDONLY)
+    try:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)

@@ -68,6 +68,7 @@ class Intake:
         self._rules = rules
         self._metrics = metrics
         self._clocks: dict[str, ScannerClock] = {}
+        self._late_scanners: set[str] = set()
         self._known: dict[int, Known] = {}
         self._pending: dict[int, Slice] = {}
         self._confirmed: set[int] = set()
@@ -279,12 +280,17 @@ class Intake:
         clock = self._clocks.get(slice_.scanner, ScannerClock(sync=self._rules.sync))
         seen = observe(clock, slice_.interval, received_s, self._rules.clock)
         self._clocks[slice_.scanner] = seen.clock
-        alarms = [("clock_jump", seen.jump), ("late_or_clock_jump", seen.late)]
-        return [(kind, text) for kind, text in alarms if text]
+        alarms = [("clock_jump", seen.jump)] if seen.jump else []
+        if seen.late and slice_.scanner not in self._late_scanners:
+            alarms.append(("late_or_clock_jump", seen.late))  # once, until one is prompt again
+        (self._late_scanners.add if seen.late else self._late_scanners.discard)(slice_.scanner)
+        return alarms
 
-    def _offset(self, slice_: Slice, now_s: float) -> OffsetBounds | None:
+    def _offset(self, slice_: Slice, received_s: float) -> OffsetBounds | None:
         clock = self._clocks.get(slice_.scanner)
-        return None if clock is None else clock.bounds(now_s, self._rules.clock)
+        if clock is None or slice_.interval is None:
+            return None
+        return clock.bounds_for(slice_.interval, received_s, self._rules.clock)
 
     # What the other processes say
 

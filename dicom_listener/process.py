@@ -11,6 +11,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import structlog
 
+from case_record.presence import Presence
 from case_record.record import CaseRecord
 from dicom_listener.assign import AssignRules
 from dicom_listener.clock import ClockRules, Sync
@@ -75,7 +76,10 @@ def intake_rules(config: Config, now_s: float) -> IntakeRules:
             arrival_mode=listener.arrival_mode,
         ),
         clock=ClockRules(
-            prompt_delay_s=listener.prompt_delay_s, late_limit_s=listener.late_limit_s
+            prompt_delay_s=listener.prompt_delay_s,
+            longest_acquisition_s=listener.longest_acquisition_s,
+            largest_offset_s=listener.largest_clock_offset_s,
+            late_limit_s=listener.late_limit_s,
         ),
         zone=_zone(listener.scanner_time_zone),
         sync=sync,
@@ -124,7 +128,6 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             inbox_folder(config.room.case_dir),
             min_free_bytes=config.listener.min_free_mib * _MIB,
         )
-        stack.callback(inbox.close)
         discarded = inbox.discard_unfinished()
         intake = Intake(record, inbox, intake_rules(config, time.time()), metrics)
         scp = open_scp(config.listener, inbox, metrics, received.put)
@@ -142,15 +145,22 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             intake.alarm("unfinished_files", f"{discarded} unanswered files of an earlier run")
         left_over = intake.take_left_over()
         log.info("serving", port=scp.port, left_over=left_over)
-        _loop(intake, scp, inbox, received, stop)
+        presence = stack.enter_context(Presence(config.room.case_dir, "listener"))
+        _loop(intake, scp, inbox, received, stop, presence)
 
 
 def _loop(
-    intake: Intake, scp: Scp, inbox: Inbox, received: "SimpleQueue[Path]", stop: threading.Event
+    intake: Intake,
+    scp: Scp,
+    inbox: Inbox,
+    received: "SimpleQueue[Path]",
+    stop: threading.Event,
+    presence: Presence,
 ) -> None:
     housekeeping_at_s = 0.0
     is_low = False
     while not stop.is_set():
+        presence.beat()
         _take_received(intake, received)
         intake.look_at_record()
         while scp.alarms:

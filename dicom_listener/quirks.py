@@ -13,6 +13,7 @@ LEGACY_ENHANCED_MR_IMAGE = "1.2.840.10008.5.1.4.1.1.4.4"
 MR_CLASSES = (MR_IMAGE, ENHANCED_MR_IMAGE, LEGACY_ENHANCED_MR_IMAGE)
 
 _GE_IMAGE_TYPE = (0x0043, 0x102F)
+_GE_CREATOR_19, _GE_DURATION = (0x0019, 0x0010), (0x0019, 0x105A)
 _SIEMENS_IMAGES_IN_MOSAIC = (0x0019, 0x100A)
 _SIEMENS_CREATOR_19 = (0x0019, 0x0010)
 _UIH_FRAMES = (0x0065, 0x1051)
@@ -84,6 +85,14 @@ def _ge_kind(top: Elements) -> Kind | None:
     value = top.integer(_GE_IMAGE_TYPE)
     kinds = {1: Kind.PHASE, 2: Kind.REAL, 3: Kind.IMAGINARY}
     return None if value is None else kinds.get(value, Kind.MAGNITUDE)
+
+
+def ge_duration_s(top: Elements) -> float | None:
+    """GE writes no AcquisitionDuration, but (0019,105A) in microseconds; None if absent."""
+    if top.text(_GE_CREATOR_19) != "GEMS_ACQU_01":
+        return None
+    duration_us = top.number(_GE_DURATION)
+    return duration_us / 1e6 if duration_us and duration_us > 0 else None
 
 
 def is_mosaic(top: Elements, image_type: tuple[str, ...]) -> bool:

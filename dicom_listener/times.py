@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone, tzinfo
 
 from dicom_listener.elements import Elements, FrameElements
+from dicom_listener.quirks import ge_duration_s
 
 _EARLIEST_YEAR = 1990  # de-identified headers say 0001 or 1900
 _DAY = timedelta(days=1)
@@ -108,19 +109,28 @@ def _duration_s(frame: FrameElements) -> tuple[float | None, bool]:
         return frame_ms / 1000, False
     if whole_s is not None and whole_s > 0:
         return whole_s, False
+    ge_s = ge_duration_s(frame.top)
+    if ge_s is not None:
+        return ge_s, False
     return _estimated_duration_s(frame), True
 
 
 def _estimated_duration_s(frame: FrameElements) -> float | None:
-    """RepetitionTime x phase-encoding steps x averages; None where any of these is missing."""
+    """RepetitionTime x phase-encoding steps x averages, which is rather too long than too short.
+
+    None where any of these is missing, and for 3-D acquisitions, which take a multiple of that.
+    """
+    top = frame.top
     repetition_ms = frame.find(
         "MRTimingAndRelatedParametersSequence", lambda item: item.number("RepetitionTime")
     )
-    steps = frame.top.number("NumberOfPhaseEncodingSteps")
-    averages = frame.find("MRAveragesSequence", lambda item: item.number("NumberOfAverages"))
-    if not repetition_ms or not steps:
+    if top.text("MRAcquisitionType").upper() == "3D" or not repetition_ms:
         return None
-    return repetition_ms / 1000 * steps * max(averages or 1.0, 1.0)
+    steps = top.number("NumberOfPhaseEncodingSteps") or max(
+        top.numbers("AcquisitionMatrix")[2:], default=0.0
+    )
+    averages = frame.find("MRAveragesSequence", lambda item: item.number("NumberOfAverages"))
+    return repetition_ms / 1000 * steps * max(averages or 1.0, 1.0) if steps else None
 
 
 def _instant(text: str, top: Elements, times: TimeFrame) -> float:

@@ -12,14 +12,13 @@ from pathlib import Path
 from robot_bridge.config import BridgeConfig, ConfigError, load_bridge_config
 from robot_bridge.daemon import JsonLines, StartError, run_bridge
 from robot_bridge.guardian import Guardian, StopOrder
-from robot_bridge.motors import Motors
 from robot_bridge.pmd401 import PmdMotors
 from robot_bridge.pmd_protocol import emergency_stop_bytes
 
 EXIT_DONE, EXIT_BAD_INPUT, EXIT_COULD_NOT = 0, 2, 3
 
 
-def make_motors(config: BridgeConfig) -> Motors:
+def make_motors(config: BridgeConfig) -> PmdMotors:
     return PmdMotors(
         config.axes,
         baud=config.controller_baud,

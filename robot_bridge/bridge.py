@@ -10,7 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from robot_bridge import rules
-from robot_bridge.journal import CommandRecord, Journal, JournalError
+from robot_bridge.journal import CommandRecord, Journal, JournalError, LatchedStop
 from robot_bridge.link import (
     BridgeEnd,
     HeartbeatReceived,
@@ -87,9 +87,11 @@ class Bridge:
         self.end = BridgeEnd(boot_id, new_session)
         self.phase = WorkPhase.START_UP
         self.armed = False
-        self.stopped = False
-        self.stop_reason = ""
-        self.stop_count = 0
+        self.stopped = journal.stop.latched
+        self.stop_reason = journal.stop.code if journal.stop.latched else ""
+        self.stop_count = journal.stop.number
+        if self.stopped:  # a restart is no re-arm
+            self.phase = WorkPhase.EMERGENCY if journal.stop.emergency else WorkPhase.STOP
         self.refused: Counter[str] = Counter()
         self.commands_done: Counter[str] = Counter()
         self.last_motion = f"boot:{boot_id}"
@@ -276,11 +278,11 @@ class Bridge:
     def _rearm(self, request: Rearm) -> None:
         next_phase = ALLOWED[self.phase].after_rearm
         assert next_phase is not None
+        self._journal.rearm(request.by, self._wall_clock())
         self.stopped = False
         self.stop_reason = ""
         self.phase = next_phase
         self.armed = True
-        self._note("rearm", by=request.by, stop_count=self.stop_count)
 
     def _set_phase(self, request: SetPhase) -> None:
         self.phase = WorkPhase(request.phase)
@@ -447,7 +449,11 @@ class Bridge:
         self.phase = WorkPhase.EMERGENCY if emergency else WorkPhase.STOP
         if emergency:
             self._park_motors()
-        self._note("stop", code=code.value, text=text, stop_count=self.stop_count)
+        latched = LatchedStop(self.stop_count, code.value, emergency, True)
+        try:
+            self._journal.latch_stop(latched, text, self._wall_clock())
+        except JournalError:
+            self.refused[Code.JOURNAL.value] += 1  # it is latched all the same, until a restart
 
     def _finish(self, state: CommandState, code: str, text: str) -> None:
         assert self._motion is not None

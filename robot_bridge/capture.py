@@ -2,12 +2,14 @@
 
 One JSON array a line: `[seconds, "tx" | "rx", url, "hex"]`, `tx` being what the host wrote, seconds
 since the capture began. A capture of a real unit becomes a test: the same driver calls against
-`ReplayPort` must write the same bytes, and get the answers that the unit gave.
+`ReplayPort` must write the captured commands, and get the answers that the unit gave.
 """
 
 import json
+import re
 import time
-from collections.abc import Iterator
+from collections import deque
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
@@ -20,7 +22,7 @@ class CaptureError(ValueError):
 
 
 class ReplayMismatchError(Exception):
-    """The host wrote other bytes than in the capture."""
+    """The host wrote a command that the capture does not answer."""
 
 
 @dataclass(frozen=True)
@@ -88,38 +90,30 @@ def _captured_lines(path: Path) -> Iterator[Captured]:
 class ReplayPort:
     """Plays the controllers' part of one line of a capture.
 
-    Answers become readable once the host has written everything that went before them in the
-    capture. Other bytes than the captured ones raise ReplayMismatchError, which names the place.
+    Each command line is answered by what followed it in the capture: the first time by the first
+    such answer, the second time by the second, and so on. Commands to different addresses may come
+    in another order than captured (axes on one bus take turns by time), but a command that was
+    never captured, or more often than captured, raises ReplayMismatchError.
     """
 
-    def __init__(self, captured: list[Captured], url: str) -> None:
-        self._script = [c for c in captured if c.url == url]
-        self._place = 0
-        self._tx_left = b""
+    def __init__(self, captured: Sequence[Captured], url: str) -> None:
+        self._answers = _answers_by_line([c for c in captured if c.url == url])
+        self._written = b""
         self._readable = bytearray()
-        self._release()
-
-    def _release(self) -> None:
-        while self._place < len(self._script) and not self._tx_left:
-            record = self._script[self._place]
-            self._place += 1
-            if record.direction == "tx":
-                self._tx_left = record.data
-            else:
-                self._readable += record.data
 
     @property
-    def finished(self) -> bool:
-        return self._place == len(self._script) and not self._tx_left
+    def left(self) -> dict[bytes, int]:
+        """Captured commands that were not asked for yet, with their number."""
+        return {line: len(answers) for line, answers in self._answers.items() if answers}
 
     def write(self, data: bytes, /) -> int:
-        for written in data:
-            if not self._tx_left or self._tx_left[0] != written:
-                raise ReplayMismatchError(
-                    f"record {self._place}: host wrote {data!r}, captured {self._tx_left!r}"
-                )
-            self._tx_left = self._tx_left[1:]
-            self._release()
+        *lines, self._written = _split_lines(self._written + data)
+        for line in lines:
+            answers = self._answers.get(line)
+            if not answers:
+                seen = "never" if answers is None else "less often"
+                raise ReplayMismatchError(f"{line!r} was written, and {seen} captured")
+            self._readable += answers.popleft()
         return len(data)
 
     def read(self, size: int = 1, /) -> bytes:
@@ -132,3 +126,21 @@ class ReplayPort:
 
     def close(self) -> None:
         pass
+
+
+def _split_lines(data: bytes) -> list[bytes]:
+    """Whole lines with their delimiter (CR, LF or semicolon), then what is left."""
+    return re.split(rb"(?<=[\r\n;])", data)
+
+
+def _answers_by_line(captured: Sequence[Captured]) -> dict[bytes, deque[bytes]]:
+    answers: dict[bytes, deque[bytes]] = {}
+    newest: deque[bytes] | None = None
+    for record in captured:
+        if record.direction == "tx":
+            for line in _split_lines(record.data)[:-1]:
+                newest = answers.setdefault(line, deque())
+                newest.append(b"")
+        elif newest is not None:
+            newest[-1] += record.data
+    return answers

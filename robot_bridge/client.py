@@ -152,9 +152,10 @@ class BridgeClient:
         open_transport: Callable[[], Transport] | None = None,
         clock: Callable[[], float] = time.monotonic,
         pause: Callable[[float], None] = time.sleep,
+        random_bits: Callable[[int], int] = secrets.randbits,
         stop_thread: bool = True,
     ) -> None:
-        """The last four replace the line and the time, for a client that lives in virtual time."""
+        """The last five replace line, time and chance, for a client that lives in virtual time."""
         self._url = url
         self._name = name
         self._heartbeat_s = heartbeat_s
@@ -175,7 +176,8 @@ class BridgeClient:
         self._known_motion = ""
         self._answer: messages.Answer | None = None
         self._sessions = 0
-        self._stopper = _Stopper(self._write_stop, clock, threaded=stop_thread)
+        self._random_bits = random_bits
+        self._stopper = _Stopper(self._write_stop, clock, random_bits, threaded=stop_thread)
 
     # --- session ------------------------------------------------------------------------------
 
@@ -216,7 +218,7 @@ class BridgeClient:
             self._end.forget_input()
         self._waiting_since_s = None
         self._answered_sequence = 0
-        self._end.say_hello(secrets.randbits(52), self._name, self._clock())
+        self._end.say_hello(self._random_bits(52), self._name, self._clock())
         self._flush()
 
     def _await_hello(self, until_s: float) -> None:
@@ -565,11 +567,17 @@ class _Stopper:
     """
 
     def __init__(
-        self, write: Callable[[bytes], None], clock: Callable[[], float], threaded: bool
+        self,
+        write: Callable[[bytes], None],
+        clock: Callable[[], float],
+        random_bits: Callable[[int], int],
+        *,
+        threaded: bool,
     ) -> None:
         self.sent = 0
         self._write = write
         self._clock = clock
+        self._random_bits = random_bits
         self._threaded = threaded
         self._changed = threading.Condition()
         self._pending: tuple[int, bool] | None = None
@@ -585,7 +593,7 @@ class _Stopper:
         with self._changed:
             if self._pending is not None:
                 emergency = emergency or self._pending[1]
-            self._pending = (secrets.randbits(32), emergency)
+            self._pending = (self._random_bits(32), emergency)
             self._sent_s = -1e9
             if self._thread is None and self._threaded:
                 self._thread = threading.Thread(target=self._watch, name="stop", daemon=True)

@@ -59,6 +59,7 @@ class TargetRun:
     """The position loop; it stays on after arrival until something ends it."""
 
     target_count: int
+    start_count: int
     speed_hz: float
     frequency_hz: float = 0.0
     timer_s: float = 0.0
@@ -175,7 +176,7 @@ class EmulatedController:
     def begin_target(self, target_count: int, speed_hz: float) -> None:
         self._begin("target")
         self.last_target = target_count
-        self.run = TargetRun(target_count, speed_hz)
+        self.run = TargetRun(target_count, self.count, speed_hz)
 
     def _begin(self, cause: str) -> None:
         self.servo_mode = False
@@ -266,16 +267,18 @@ class EmulatedController:
             run.reached = run.idle = True
             run.frequency_hz = run.due = 0.0
             return
-        if self._beyond_limit(math.copysign(1, error)):
+        if self._beyond_limit(run, error):
             self.target_limit = run.idle = True
             return
         run.idle = False
         self._regulate(run, error, tick_s)
 
-    def _beyond_limit(self, direction: float) -> bool:
-        if direction > 0:
-            return self.count >= self.settings[y.LIMIT_B]
-        return self.count <= self.settings[y.LIMIT_A]
+    def _beyond_limit(self, run: TargetRun, error: int) -> bool:
+        """Beyond a target limit, and not on the way back from there."""
+        outwards = self.count - run.start_count
+        if self.count >= self.settings[y.LIMIT_B]:
+            return error > 0 or outwards > 0
+        return self.count <= self.settings[y.LIMIT_A] and (error < 0 or outwards < 0)
 
     def _regulate(self, run: TargetRun, error: int, tick_s: float) -> None:
         gain = self.settings[y.STEPS_PER_COUNT] / SPEED_PARAMETER_PER_COUNT  # microsteps a count

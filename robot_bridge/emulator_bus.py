@@ -98,6 +98,11 @@ class EmulatedBus:
         if self.faults.lose_commands > 0:
             self.faults.lose_commands -= 1
             return
+        if self.faults.garble_commands > 0 or (
+            self._rng.random() < self.faults.garble_command_probability
+        ):
+            self.faults.garble_commands = max(0, self.faults.garble_commands - 1)
+            line = self._with_wrong_bit(line)
         matched = re.fullmatch(rb"X(\d{0,3})(~?)([\x20-\x7e]*)", line)
         if not matched:
             return  # another device's chatter
@@ -179,10 +184,13 @@ class EmulatedBus:
             return raw[: len(raw) // 2]
         if faults.garble_replies > 0 or chance() < faults.garble_probability:
             faults.garble_replies = max(0, faults.garble_replies - 1)
-            place = self._rng.randrange(len(raw) - 1)
-            wrong = raw[place] ^ (1 << self._rng.randrange(8))
-            return raw[:place] + bytes([wrong]) + raw[place + 1 :]
+            return self._with_wrong_bit(raw)
         return raw
+
+    def _with_wrong_bit(self, raw: bytes) -> bytes:
+        place = self._rng.randrange(len(raw))
+        wrong = raw[place] ^ (1 << self._rng.randrange(8))
+        return raw[:place] + bytes([wrong]) + raw[place + 1 :]
 
     def _send(self, data: bytes, not_before_s: float) -> None:
         begins_s = max(not_before_s, self._line_free_s)

@@ -101,7 +101,7 @@ def _status(c: EmulatedController, args: list[int]) -> str:
         4: lambda c: f"{_status_word(c)},{_io_word(c)}",
     }
     number = args[0] if args else 0
-    if number not in readings:
+    if number not in readings or (not args and not c.switches.bare_status):
         raise _NotUnderstoodError
     return readings[number](c)
 

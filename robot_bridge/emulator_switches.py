@@ -23,6 +23,7 @@ class Switches:
     overspeed: Literal["clamp", "refuse"] = "clamp"
     target_beyond_limit: Literal["stop_there", "refuse"] = "stop_there"
     broadcast_stop: bool = True
+    bare_status: bool = True  # `U` without a digit means `U0`
     encoder_type_description: bool = True  # `Y13:1, Quad_32`
 
 
@@ -47,7 +48,9 @@ class LineFaults:
     garble_replies: int = 0
     truncate_replies: int = 0
     lose_commands: int = 0
+    garble_commands: int = 0
     drop_probability: float = 0.0
     garble_probability: float = 0.0
+    garble_command_probability: float = 0.0
     reply_delay_s: float = 0.0
     chatter: list[bytes] = field(default_factory=list)  # each is sent ahead of a reply

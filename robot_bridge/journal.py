@@ -1,4 +1,4 @@
-"""What the bridge must know after a crash: commands begun and ended, and the insertion lock.
+"""What the bridge must know after a crash: commands begun and ended, latched stops, the lock.
 
 One line an entry, JSON behind its CRC-32, only ever appended. Entries that decide about motion are
 on the disk (fsync) before `append` returns. A torn last line is what a crash leaves and is cut off;
@@ -57,6 +57,16 @@ def _entry(line: bytes) -> dict[str, Any]:
     return entry
 
 
+@dataclass(frozen=True)
+class LatchedStop:
+    """The newest stop: its number, why, and whether it still waits for an operator's re-arm."""
+
+    number: int = 0
+    code: str = ""
+    emergency: bool = False
+    latched: bool = False
+
+
 class Journal:
     """The open journal of one bridge; a second bridge on the same folder is refused."""
 
@@ -65,6 +75,7 @@ class Journal:
         self.commands: dict[str, CommandRecord] = {}
         self.measurements_used: set[str] = set()
         self.insertion_locked = False
+        self.stop = LatchedStop()
         self._sync = sync
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -119,6 +130,10 @@ class Journal:
             )
         elif kind == "lock":
             self.insertion_locked = bool(entry["locked"])
+        elif kind == "stop":
+            self.stop = LatchedStop(entry["number"], entry["code"], entry["emergency"], True)
+        elif kind == "rearm":
+            self.stop = replace(self.stop, latched=False)
 
     def begin(self, record: CommandRecord, wall_s: float) -> None:
         """A command is accepted and may move from now on. Durable. Raises JournalError."""
@@ -135,6 +150,19 @@ class Journal:
     def lock(self, locked: bool, by: str, wall_s: float) -> None:
         """Durable. Raises JournalError."""
         self._append({"kind": "lock", "t": wall_s, "locked": locked, "by": by})
+
+    def latch_stop(self, stop: LatchedStop, text: str, wall_s: float) -> None:
+        """Durable. Raises JournalError (the stop itself must not depend on it)."""
+        self._append(
+            {
+                "kind": "stop", "t": wall_s, "number": stop.number, "code": stop.code,
+                "emergency": stop.emergency, "text": text,
+            }
+        )  # fmt: skip
+
+    def rearm(self, by: str, wall_s: float) -> None:
+        """Durable. Raises JournalError, and then the stop stays latched."""
+        self._append({"kind": "rearm", "t": wall_s, "number": self.stop.number, "by": by})
 
     def note(self, what: str, wall_s: float, **details: Any) -> None:
         """Anything else worth knowing afterwards. In the file, not necessarily on the disk yet."""

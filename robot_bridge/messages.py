@@ -211,7 +211,7 @@ class Hello(Message):
 class Status(Message):
     """The bridge as it stands at `now_ms` of its own clock (milliseconds since it booted).
 
-    stop_count: how many stops were latched since boot; `stopped` says if one is latched now.
+    stop_count: the number of the newest stop (the journal counts them); `stopped`: it is latched.
     last_motion: names the last thing that changed where the robot stands (a command id, or
         "boot:…", "declared:…"); a move must be based on it.
     command_*: the command in flight, or the last one that ended.

@@ -7,6 +7,7 @@ drivers, not tried on hardware yet: it says so whenever it starts.
 """
 
 import logging
+import termios
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -19,7 +20,7 @@ from robot_bridge.config import AxisConfig
 from robot_bridge.motors import MotorError, MotorStatus
 from robot_bridge.pmd_axis import AxisFaultError, PmdAxis
 from robot_bridge.pmd_line import PmdLine, Port, Procedure, Task
-from robot_bridge.pmd_protocol import PmdError, PmdTimeoutError
+from robot_bridge.pmd_protocol import PmdEchoError, PmdError, PmdTimeoutError
 
 log = logging.getLogger(__name__)
 
@@ -31,13 +32,36 @@ STOP_ANSWER_TIMEOUT_S = 0.04
 INITIALISE_DEADLINE_S = 10.0
 DECLARE_DEADLINE_S = 2.0
 
+# Faults at rest that mean that a motor may move.
+NEEDS_STOP = frozenset({"damaged_command", "moving_by_itself"})
+
 OpenPort = Callable[[str], Port]
 
 
-def open_serial_port(url: str, baud: int) -> Port:
-    """A device, a pseudo-terminal or any other pyserial URL. Raises OSError."""
-    port: Port = serial.serial_for_url(url, baudrate=baud, timeout=READ_WAIT_S, write_timeout=0.1)
-    return port
+class SerialPort:
+    """A device, a pseudo-terminal or any other pyserial URL. Every failure is an OSError."""
+
+    def __init__(self, url: str, baud: int) -> None:
+        self._port = serial.serial_for_url(
+            url, baudrate=baud, timeout=READ_WAIT_S, write_timeout=0.1
+        )
+
+    def read(self, size: int = 1, /) -> bytes:
+        data: bytes = self._port.read(size)
+        return data
+
+    def write(self, data: bytes, /) -> int | None:
+        written: int | None = self._port.write(data)
+        return written
+
+    def reset_input_buffer(self) -> None:
+        try:
+            self._port.reset_input_buffer()
+        except termios.error as error:  # pyserial lets this one through
+            raise OSError(*error.args) from error
+
+    def close(self) -> None:
+        self._port.close()
 
 
 class PmdMotors:
@@ -59,7 +83,7 @@ class PmdMotors:
         self._park_after_move = park_after_move
         self._capture_file = capture_file
         self._capture: CaptureWriter | None = None
-        self._open_port = open_port or (lambda url: open_serial_port(url, baud))
+        self._open_port = open_port or (lambda url: SerialPort(url, baud))
         self._lines: dict[str, PmdLine] = {}
         self._ports: list[Port] = []
         self._motion: dict[str, Task] = {}
@@ -164,6 +188,29 @@ class PmdMotors:
         for name, axis in self._axes.items():
             self._other[name] = self._line_of(axis).start(axis.park(), f"parking of {name}")
 
+    def run_steps(self, name: str, steps: int) -> None:
+        """Begin an open-loop run of waveform steps, forward positive, of one axis (calibration).
+
+        For an engineer at the controller: the bridge never calls it, it moves in setpoints alone.
+        Raises MotorError if the run could leave the travel even with steps twice as long as set.
+        """
+        self._require_ready()
+        axis = self._axis(name)
+        _check_run(axis, steps)
+        self._begin()
+        self._setpoints_um = {}
+        procedure = axis.run_steps(steps)
+        self._motion[name] = self._line_of(axis).start(procedure, f"run of {name}")
+
+    def measure_um(self, name: str) -> float:
+        """The encoder's position, asked for now. Raises MotorError."""
+        self._require_ready()
+        axis = self._axis(name)
+        if not axis.closed_loop:
+            raise MotorError("no_encoder", f"axis {name} runs in open loop")
+        self._run(axis, axis.measure(), "measurement", self._clock() + DECLARE_DEADLINE_S)
+        return axis.position_um
+
     def declare_position(self, positions_um: Mapping[str, int]) -> None:
         self._require_ready()
         axes = {name: self._axis(name) for name in positions_um}
@@ -214,8 +261,10 @@ class PmdMotors:
         share_s = POLL_BUDGET_S / len(self._lines)
         for line in self._lines.values():
             line.step(share_s)
-        self._collect(self._other)
+        failed_at_rest = self._collect(self._other)
         failed = self._collect(self._motion)
+        if failed_at_rest and failed_at_rest[0] in NEEDS_STOP:
+            failed = failed_at_rest
         if failed:
             self._fail(*failed)
         elif self._motion and all(task.done for task in self._motion.values()):
@@ -231,6 +280,8 @@ class PmdMotors:
             if task.error is not None:
                 axis = self._axes[name]
                 axis.fault = failed = _code_and_text(axis, task.error)
+                if isinstance(task.error, PmdEchoError):
+                    axis.certain = False
                 log.warning("%s", axis.fault[1])
             if tasks is self._other:
                 del tasks[name]
@@ -345,8 +396,32 @@ def _check_setpoint(axis: AxisConfig, setpoint_um: int) -> None:
         )
 
 
+def _check_run(axis: PmdAxis, steps: int) -> None:
+    """An open-loop axis whose position nobody declared has none to check: the engineer looks."""
+    config = axis.config
+    if not isinstance(steps, int) or steps == 0:
+        raise MotorError("bad_run", f"axis {config.name}: a run of {steps!r} steps")
+    if not (axis.closed_loop or axis.certain):
+        return
+    reach_um = 2 * abs(steps) * max(config.step_um_forward, config.step_um_reverse)
+    direction = config.sign * (1 if steps > 0 else -1)
+    end_um = axis.readback_um() + direction * reach_um
+    if not config.travel_min_um <= end_um <= config.travel_max_um:
+        raise MotorError(
+            "beyond_travel",
+            f"axis {config.name}: {steps:+d} steps could reach {end_um:.0f} um, outside "
+            f"{config.travel_min_um}..{config.travel_max_um} um",
+        )
+
+
 def _code_and_text(axis: PmdAxis, error: PmdError) -> tuple[str, str]:
     if isinstance(error, AxisFaultError):
         return error.code, str(error)
-    code = "no_answer" if isinstance(error, PmdTimeoutError) else "protocol"
+    code = next((c for kind, c in _CODES.items() if isinstance(error, kind)), "protocol")
     return code, f"axis {axis.config.name}: {error}"
+
+
+_CODES: dict[type[PmdError], str] = {
+    PmdTimeoutError: "no_answer",
+    PmdEchoError: "damaged_command",
+}

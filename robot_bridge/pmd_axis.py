@@ -6,7 +6,7 @@ every motion the controller is told to leave target mode, so that nothing regula
 """
 
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -35,6 +35,7 @@ POLL_PAUSE_S = 0.01
 MIN_SPEED_HZ = 10
 RAMP_DOWN_HZ_PER_MS = 10
 AVOID_OVERSHOOT = 3
+NO_ENCODER = 0
 STALL_WINDOW_S = 0.5
 RUNAWAY_MARGIN_UM = 100.0
 # The response delay (Y44) returns to 20 us at every power-on and is not kept in flash: other
@@ -78,6 +79,8 @@ class PmdAxis:
         self._run: _Run | None = None
         self._at_rest_um: float | None = None
         self._expected_parked: bool | None = None
+        # One wrong bit makes `T0` (go to zero) of `U0`, but a harmless question of a bare `U`.
+        self._status_body = "U"
 
     @property
     def address(self) -> int:
@@ -114,15 +117,20 @@ class PmdAxis:
         assert reply is not None  # the line answers every command
         return reply
 
-    def _set(self, number: int, value: int) -> Steps[None]:
-        """Write a setting, and believe the readback alone."""
-        yield pmd_protocol.set_parameter(self.address, number, value)
-        got = (yield from self._ask(f"Y{number}")).integer()
-        if got != value:
-            raise self._error("setting", f"Y{number} reads {got} after it was set to {value}")
+    def _set_all(self, values: Mapping[int, int]) -> Steps[None]:
+        """Write settings, and believe the readback alone.
+
+        Read only when all are written: a damaged command may have changed another one.
+        """
+        for number, value in values.items():
+            yield pmd_protocol.set_parameter(self.address, number, value)
+        for number, value in values.items():
+            got = (yield from self._ask(f"Y{number}")).integer()
+            if got != value:
+                raise self._error("setting", f"Y{number} reads {got} after it was set to {value}")
 
     def _read_status(self) -> Steps[Status]:
-        reply = yield from self._ask("U0")
+        reply = yield from self._ask(self._status_body)
         self.status = parse_status(reply.value)
         if reply.retried and (yield from self._ask("Y44")).integer() == POWER_ON_DELAY_US:
             self.status |= Status.RESET  # the answer that told it was lost
@@ -132,6 +140,14 @@ class PmdAxis:
         if self.closed_loop:
             count = (yield from self._ask("E")).integer()
             self.position_um = pmd_units.um_from_count(self.config, count)
+
+    def _read_position_surely(self) -> Steps[None]:
+        """The line has no checksum: two readings that agree, or the third decides."""
+        yield from self._read_position()
+        first_um = self.position_um
+        yield from self._read_position()
+        if abs(self.position_um - first_um) > self._arrival_um:
+            yield from self._read_position()
 
     def _check_status(self) -> Steps[None]:
         """Raise AxisFaultError for whatever the status says is wrong."""
@@ -181,7 +197,7 @@ class PmdAxis:
         if model not in MODELS:
             raise self._error("unknown_controller", f"identifies as '{self.identity}'")
         yield pmd_protocol.stop(self.address)
-        first = yield from self._read_status()
+        first = yield from self._first_status()
         yield from self._read_status()  # what was latched is cleared now
         mark = (yield from self._ask("Y44")).integer()
         declared = mark == DECLARED_DELAY_US and not first & Status.RESET
@@ -189,25 +205,41 @@ class PmdAxis:
         yield from self._read_position()
         self.certain = declared and self.closed_loop
         if not self.certain:
-            yield from self._set(44, INITIALISED_DELAY_US)
+            yield from self._set_all({44: INITIALISED_DELAY_US})
         self._expected_parked = self.parked
         self._at_rest_um = self.position_um
         yield from self._check_status()
 
+    def _first_status(self) -> Steps[Status]:
+        """Find out which form of the question the controller understands."""
+        self._status_body = "U"
+        try:
+            return (yield from self._read_status())
+        except PmdError:
+            self._status_body = "U0"
+        return (yield from self._read_status())
+
     def _apply_settings(self, model_max_hz: int) -> Steps[None]:
         if self.closed_loop:
             low, high = pmd_units.count_limits(self.config)
-            for number, value in (
-                (13, self.config.encoder_type),
-                (3, low),
-                (4, high),
-                (5, self.config.tolerance_counts),
-                (7, MIN_SPEED_HZ),
-                (10, RAMP_DOWN_HZ_PER_MS),
-                (11, pmd_units.speed_parameter(self.config)),
-                (12, AVOID_OVERSHOOT),
-            ):
-                yield from self._set(number, value)
+            yield from self._set_all(
+                {
+                    13: self.config.encoder_type,
+                    3: low,
+                    4: high,
+                    5: self.config.tolerance_counts,
+                    7: MIN_SPEED_HZ,
+                    10: RAMP_DOWN_HZ_PER_MS,
+                    11: pmd_units.speed_parameter(self.config),
+                    12: AVOID_OVERSHOOT,
+                }
+            )
+        else:
+            # No encoder, at count 0 between limits at 0: no target command, meant or made of
+            # another one by a wrong bit, can move the motor.
+            yield from self._set_all({13: NO_ENCODER})
+            yield Command(self.address, "E0", reads=False)
+            yield from self._set_all({3: 0, 4: 0})
         yield from self._read_speed_cap(model_max_hz)
 
     def _read_speed_cap(self, model_max_hz: int) -> Steps[None]:
@@ -259,6 +291,7 @@ class PmdAxis:
         try:
             yield from self.unpark()
             yield from self._read_position()
+            self._note_drift()
             for leg_um in pmd_units.legs_um(self.config, self.position_um, setpoint_um):
                 if self.closed_loop:
                     yield from self._closed_leg(leg_um)
@@ -273,7 +306,9 @@ class PmdAxis:
     def _closed_leg(self, setpoint_um: int) -> Steps[None]:
         self._at_rest_um = None
         target = pmd_units.count_from_um(self.config, setpoint_um)
-        yield pmd_protocol.move_to_count(self.address, target, self.speed_hz)
+        go = pmd_protocol.move_to_count(self.address, target, self.speed_hz)
+        yield pmd_protocol.store(go)
+        yield pmd_protocol.run_stored(go)
         watch = _ProgressWatch(self, abs(setpoint_um - self.position_um), self._clock())
         while True:
             yield Pause(POLL_PAUSE_S)
@@ -290,7 +325,8 @@ class PmdAxis:
                 raise self._error("stopped", f"left target mode {error_um:.0f} um short")
             watch.check(error_um, self._clock())
         yield pmd_protocol.stop(self.address)
-        yield from self._read_position()
+        yield pmd_protocol.overwrite_stored(self.address)
+        yield from self._read_position_surely()
 
     @property
     def _arrival_um(self) -> float:
@@ -320,20 +356,34 @@ class PmdAxis:
                 )
             self.position_um = run.from_um + pmd_units.um_from_microsteps(self.config, microsteps)
             self._run = None
+            yield pmd_protocol.overwrite_stored(self.address)
         finally:
             if self._run is not None:  # stopped, failed or given up
                 self.position_um = self._estimate_um(run)
                 self.certain = False
                 self._run = None
 
+    def run_steps(self, steps: int) -> Procedure:
+        """A run of whole waveform steps whatever they amount to; the encoder, if any, tells."""
+        self.fault = None
+        yield from self.unpark()
+        yield from self.run_open_loop(steps * MICROSTEPS_PER_STEP)
+        yield from self._read_position()
+        self._at_rest_um = self.position_um
+
+    def measure(self) -> Procedure:
+        yield from self._read_position_surely()
+
     def _begin_run(self, run: _Run, phase: int, expected_phase: int) -> Steps[None]:
-        """Send the run once. If its answer is lost, find out; never send it again.
+        """Start the run once. If that answer is lost, find out; never start it again.
 
         Even a microstep counter that did not change is no proof that nothing moved (a unit may
         count otherwise than the manual says), so only a proof of motion lets us go on.
         """
+        go = pmd_protocol.run_microsteps(self.address, run.microsteps, run.speed_hz)
+        yield pmd_protocol.store(go)
         try:
-            yield pmd_protocol.run_microsteps(self.address, run.microsteps, run.speed_hz)
+            yield pmd_protocol.run_stored(go)
         except PmdTimeoutError:
             status = yield from self._read_status()
             now_at = yield from self._microstep_phase()
@@ -388,9 +438,9 @@ class PmdAxis:
             yield from self._read_position()
             if abs(self.position_um - position_um) > self._arrival_um:
                 raise self._error("setting", f"reads {self.position_um:.0f} um after E{count}")
+            yield from self._set_all({44: DECLARED_DELAY_US})
         else:
             self.position_um = float(position_um)
-        yield from self._set(44, DECLARED_DELAY_US)
         self._at_rest_um = self.position_um
         self.certain = True
         self.fault = None
@@ -408,6 +458,8 @@ class PmdAxis:
             self.certain = False
         yield from self._read_position()
         self._at_rest_um = self.position_um
+        if not status & (ERRORS | Status.RESET | Status.OVERHEAT | Status.EXTERNAL_LIMIT):
+            self.fault = None
 
 
 class _ProgressWatch:

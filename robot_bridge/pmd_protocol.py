@@ -34,6 +34,13 @@ class PmdSyntaxError(PmdError):
     """The controller did not understand the command (`_??_`)."""
 
 
+class PmdEchoError(PmdError):
+    """A controller echoed what was not asked for: a command was damaged on the line.
+
+    Raised for what moves a motor or sets its position; other damage is only a missing answer.
+    """
+
+
 class PmdRefusedError(PmdError):
     """The controller understood and cannot do it now (`!`); a parked motor unparks instead."""
 
@@ -109,6 +116,28 @@ def run_microsteps(address: int, microsteps: int, speed_hz: int) -> Command:
     sign = -1 if microsteps < 0 else 1
     body = f"J{sign * steps},{sign * rest},{_checked_speed(speed_hz)}"
     return Command(address, body, reads=False, repeatable=False)
+
+
+def store(command: Command) -> Command:
+    """The same command with a trailing `b`: kept by the controller, not yet run.
+
+    The line has no checksum, and one wrong bit makes `T0` of `U0`. A motion is therefore stored
+    first; only when its echo has shown that it arrived unharmed is it run, by `run_stored`.
+    """
+    return Command(command.address, command.body + "b", reads=False)
+
+
+def run_stored(command: Command) -> Command:
+    """`B1`, as repeatable as the stored command itself."""
+    return Command(command.address, "B1", reads=False, repeatable=command.repeatable)
+
+
+def overwrite_stored(address: int) -> Command:
+    """A harmless question takes the place of a stored motion.
+
+    Not `B0`, which would clear it: one wrong bit makes `B1` of that, and the motion runs again.
+    """
+    return Command(address, "Eb", reads=False)
 
 
 def _checked_speed(speed_hz: int) -> int:
@@ -201,15 +230,26 @@ class Reply:
             raise PmdReplyError(f"'{self.value}' is not a list of integers") from None
 
 
+_GRAVE_ECHO = re.compile(r"X\d{0,3}~?(?:[JTRCIE][=\d+-].*(?<!b)|B1)$")
+
+
+def is_grave(line: str) -> bool:
+    """Whether this is the echo of a command that moves something or sets its position."""
+    return _GRAVE_ECHO.match(line) is not None and ":" not in line
+
+
 def match_reply(command: Command, line: str) -> Reply | None:
     """The reply that `line` is to `command`; None if it answers something else (chatter).
 
-    Raises PmdSyntaxError or PmdRefusedError if the controller says so.
+    Raises PmdSyntaxError or PmdRefusedError if the controller says so, PmdEchoError if any
+    controller echoes a motion or a new position that this command did not ask for.
     """
     address, body = f"X{command.address}", command.body
     if line.startswith(f"{address}_??_"):
         raise PmdSyntaxError(f"controller {command.address} did not understand '{command.text}'")
     if not line.startswith(address + body):
+        if is_grave(line):
+            raise PmdEchoError(f"'{line}' was answered to '{command.text}': damaged on the line")
         return None
     rest = line[len(address + body) :]
     if rest in ("!", ":!"):
@@ -218,4 +258,6 @@ def match_reply(command: Command, line: str) -> Reply | None:
         return Reply(rest[1:].strip())
     if not command.reads and not rest:
         return Reply()
+    if is_grave(line):
+        raise PmdEchoError(f"'{line}' was answered to '{command.text}': damaged on the line")
     return None

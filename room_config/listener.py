@@ -59,6 +59,17 @@ class ListenerConfig(Section):
         description="The promptest slice arrives this soon after its acquisition ended; bounds "
         "the offset of the scanner's clock where no sync is given.",
     )
+    longest_acquisition_s: float = Field(
+        default=30.0,
+        gt=0,
+        description="No acquisition lasts longer that comes without its duration; a slice without "
+        "one is used only after the robot has stood that long.",
+    )
+    largest_clock_offset_s: float = Field(
+        default=600.0,
+        gt=0,
+        description="Without clock_offset_s: a scanner's clock further off is not believed.",
+    )
     late_limit_s: float = Field(
         default=120.0,
         gt=0,

@@ -1,12 +1,34 @@
 """`[service]`: the page, the API, the procedure."""
 
+from datetime import UTC, date, datetime
+from pathlib import Path
 from typing import Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from room_config.section import Section
 
 Strategy = Literal["base", "bicubic", "sr", "hybrid", "adaptive"]
+
+
+class AccessToken(Section):
+    """Somebody who may use the service. `autospine token NAME` makes one."""
+
+    name: str = Field(
+        min_length=1, max_length=64, description="Who; this stands in the record with every action."
+    )
+    role: Literal["viewer", "operator"] = Field(
+        description="A viewer may look and press STOP; an operator may do everything."
+    )
+    sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="Hash of the token, hexadecimal.")
+    expires: date | None = Field(
+        default=None, description="Last day (UTC) on which the token is good; absent: no end."
+    )
+
+    def has_expired(self, wall_s: float) -> bool:
+        if self.expires is None:
+            return False
+        return datetime.fromtimestamp(wall_s, UTC).date() > self.expires
 
 
 class ServiceConfig(Section):
@@ -15,6 +37,22 @@ class ServiceConfig(Section):
     bridge_link: str = Field(
         min_length=1, description="Serial device or pyserial URL on which the bridge answers."
     )
+    token: list[AccessToken] = Field(
+        default=[],
+        description="Who may use the service, one [[service.token]] table each. Without any it "
+        "listens on loopback only and everybody there is an operator.",
+    )
+    session_hours: float = Field(
+        default=12.0, gt=0, le=168, description="A login on the page lasts this long."
+    )
+    lock_out_after: int = Field(
+        default=5, ge=2, description="So many wrong tokens from one address lock it out."
+    )
+    lock_out_s: float = Field(default=60.0, gt=0, description="A lock-out lasts this long.")
+    tls_certificate: Path | None = Field(
+        default=None, description="PEM file; with tls_key the page is served over HTTPS."
+    )
+    tls_key: Path | None = Field(default=None, description="PEM file of the private key.")
     heartbeat_s: float = Field(default=0.2, gt=0, le=1)
     axes: list[str] = Field(
         default=["xt", "yt"],
@@ -61,3 +99,12 @@ class ServiceConfig(Section):
         lt=1,
         description="Relative scatter of a move's length from one move to the next.",
     )
+
+    @model_validator(mode="after")
+    def _access_is_whole(self) -> "ServiceConfig":
+        if (self.tls_certificate is None) != (self.tls_key is None):
+            raise ValueError("tls_certificate and tls_key go together")
+        names = [token.name for token in self.token]
+        if len(set(names)) != len(names):
+            raise ValueError("two tokens have the same name")
+        return self

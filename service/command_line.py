@@ -28,6 +28,7 @@ SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "locate": ("service.locate:app", "Find the round objects in DICOM files."),
     "reconstruct": ("service.reconstruct_files:app", "Super-resolution image from DICOM files."),
     "study": ("studies.command_line:app", "The paper's studies, and ours beside them."),
+    "token": ("service.token_command:token", "Make a token for somebody who may use the page."),
     "check-config": ("service.check_config:app", "Check a room's configuration."),
 }
 

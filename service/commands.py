@@ -7,16 +7,17 @@ text says what to do instead; every command that is carried out is an event that
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from case_record.record import CaseRecord
+from dicom_listener.intake import reassign
 from robot_bridge.client import BridgeError, BridgeStatus
 from room_config.load import Config
-from service.approach import ApproachArguments
+from service.approach import CONFIRM, ApproachArguments
 from service.calibration import Calibration, CalibrationArguments
 from service.estimate import MotionNoise
 from service.execution import Execution
@@ -24,6 +25,7 @@ from service.plan import PlanRefusedError, Travel, check_travel
 from service.procedures import (
     APPROACH,
     CALIBRATION,
+    JOG,
     approach_arguments,
     calibration_arguments,
     latest_calibration,
@@ -95,8 +97,8 @@ class Commands:
             return
         try:
             self._link.client.set_insertion_lock(True, _SOURCE)
-        except BridgeError as error:
-            raise ConflictError("robot_refused", str(error)) from error
+        except BridgeError:
+            return  # asked again at the next tick; until then `may_start` refuses every motion
         self._note("insertion_locked", _SOURCE, {})
 
     # Procedures
@@ -136,6 +138,27 @@ class Commands:
             raise ConflictError("busy", "Abort the running procedure before changing the target.")
         self._note("target_set", by, {"patient_mm": [float(value) for value in patient_mm]})
 
+    def set_entry(self, patient_mm: Sequence[float], by: str) -> None:
+        """Set the planned skin point, patient mm (LPS)."""
+        self._note("entry_set", by, {"patient_mm": [float(value) for value in patient_mm]})
+
+    def jog(self, axis: str, distance_um: int, by: str) -> int:
+        """Move one axis by hand; returns the id of the procedure that does it."""
+        self._may_start()
+        status = self._linked()
+        travel = self._travel()
+        if axis not in travel or axis not in status.positions_um:
+            raise ConflictError("unknown_axis", f"The robot has no axis {axis!r}.")
+        if not status.position_certain:
+            raise ConflictError("position_uncertain", "Check the robot's position and re-arm.")
+        setpoint_um = status.positions_um[axis] + distance_um
+        try:
+            check_travel({axis: setpoint_um}, travel)
+        except PlanRefusedError as error:
+            raise ConflictError("out_of_travel", f"Not moved: {error}.") from error
+        setpoints_um = {**status.positions_um, axis: setpoint_um}
+        return self._begin(JOG, {"setpoints_um": setpoints_um}, by)
+
     def start_approach(self, by: str) -> int:
         """Begin the approach to the target; returns its procedure id."""
         self._may_start()
@@ -161,15 +184,60 @@ class Commands:
         )
         return self._begin(APPROACH, approach_arguments(arguments, start), by)
 
-    def answer(self, question_id: str, choice: str, by: str) -> None:
-        """Answer the question that is on the page; void if it is another one by now."""
+    def answer(self, question_id: str, choice: str, by: str, plan_id: str | None = None) -> None:
+        """Answer the question that is on the page; void if it is another one by now.
+
+        A confirmed plan must also still rest on where the robot stands and on the newest
+        measurement.
+        """
         question = self._execution.question
         if question is None or question.question_id != question_id:
             raise ConflictError("stale_question", "This question is not open any more.")
         if choice not in question.choices:
             raise ConflictError("unknown_choice", f"Choose one of {', '.join(question.choices)}.")
-        self._note("answered", by, {"question_id": question_id, "choice": choice})
+        if choice == CONFIRM and question.plan is not None:
+            self._check_plan(question.plan, plan_id)
+        body = {"question_id": question_id, "choice": choice}
+        self._note("answered", by, body if plan_id is None else {**body, "plan_id": plan_id})
         self._execution.answer(choice, by)
+
+    def _check_plan(self, plan: Mapping[str, Any], plan_id: str | None) -> None:
+        status = self._linked()
+        if plan_id is not None and plan_id != plan["plan_id"]:
+            raise ConflictError("stale_plan", "This plan was replaced: read the one shown now.")
+        if status.stopped or not status.armed:
+            raise ConflictError("not_armed", "Re-arm the robot; then start the approach again.")
+        newest = self._record.last_measurement()
+        if newest is not None and newest.measurement_id != plan["measurement_id"]:
+            raise ConflictError("stale_plan", "A newer measurement exists: start again.")
+        for axis, planned_from_um in plan["from_um"].items():
+            moved_um = status.positions_um.get(axis, planned_from_um) - planned_from_um
+            if not abs(moved_um) <= self._config.service.repeatability_um:
+                raise ConflictError(
+                    "stale_plan",
+                    f"Axis {axis} has moved by {moved_um} µm since this plan was made: "
+                    "end the procedure and start the approach again.",
+                )
+
+    # Slices and the case
+
+    def assign_slice(self, slice_id: int, hold_id: int | None, why: str, by: str) -> None:
+        """Overrule the listener: the slice belongs to this hold, or (None) to none."""
+        row = self._record.slice(slice_id)
+        if hold_id is not None:
+            self._record.hold(hold_id)
+            if not row.header.get("geometry"):
+                raise ConflictError("no_geometry", f"Slice {slice_id} has no geometry: rescan.")
+        reassign(self._record, slice_id, hold_id, by, why or "decided on the page")
+
+    def confirm_acquisition(self, hold_id: int, by: str) -> None:
+        """The operator says that the slices of a hold were acquired (rooms in arrival mode)."""
+        self._record.hold(hold_id)
+        self._note("acquisition_confirmed", by, {"hold_id": hold_id})
+
+    def describe_case(self, by: str, **words: str) -> None:
+        """Write down what the operator says about the case."""
+        self._note("case_described", by, dict(words))
 
     # The puncture
 
@@ -215,13 +283,10 @@ class Commands:
         return status
 
     def _may_start(self) -> None:
-        status = self._linked()
-        if self._record.running_procedure() is not None:
-            raise ConflictError("busy", "A procedure is running: wait for its end or abort it.")
-        if ready_arrival(self._record) is not None or status.insertion_locked:
-            raise ConflictError("insertion_locked", "Motion is locked until the needle is out.")
-        if status.stopped or not status.armed:
-            raise ConflictError("not_armed", "Re-arm the robot first.")
+        self._linked()
+        refusal = may_start(self._record, self._link.status)
+        if refusal is not None:
+            raise refusal
 
     def _shifts_px(self) -> tuple[tuple[float, float], ...]:
         name = self._config.service.shift_set
@@ -254,6 +319,19 @@ class Commands:
         return replace(
             calibration, estimate=replace(moved, covariance_mm2=moved.covariance_mm2 + unseen)
         )
+
+
+def may_start(record: CaseRecord, status: BridgeStatus | None) -> ConflictError | None:
+    """Why the robot may not begin to move now, or None."""
+    if status is None:
+        return ConflictError("no_link", "No link to the robot.")
+    if record.running_procedure() is not None:
+        return ConflictError("busy", "A procedure is running: wait for its end or abort it.")
+    if ready_arrival(record) is not None or status.insertion_locked:
+        return ConflictError("insertion_locked", "Motion is locked until the needle is out.")
+    if status.stopped or not status.armed:
+        return ConflictError("not_armed", "Re-arm the robot first.")
+    return None
 
 
 def ready_arrival(record: CaseRecord) -> tuple[int, dict[str, Any]] | None:

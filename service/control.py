@@ -10,26 +10,42 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from concurrent.futures import Future
-from functools import partial
+from dataclasses import dataclass
 from typing import Any
 
 import structlog
 
-from case_record.record import CaseRecord
+from case_record.record import CaseRecord, CaseRecordError
 from room_config.load import Config
 from service.commands import Commands, ConflictError
+from service.describe import Describer
 from service.execution import Execution, ProcedureAbortedError
 from service.procedures import build_procedure, result_to_json
 from service.room_link import RoomLink
 from service.runner import ReplayMismatchError, run_procedure
 from service.sensing import ProcedureFailedError
-from service.state import RoomState, describe
+from service.state import RoomState
 
 _TICK_S = 0.01
 _PUBLISH_EVERY_S = 0.1
+_LEAST_BETWEEN_STATES_S = 0.02
+_PATIENCE_S = 30.0
+# what may be done while the robot moves; all else waits for standstill and is refused meanwhile
+_WHILE_MOVING = frozenset(
+    {"note_stop", "abort", "describe_case", "assign_slice", "confirm_acquisition", "set_entry"}
+)
 log = structlog.get_logger()
+
+
+@dataclass(frozen=True, eq=False)
+class _Asked:
+    """A command of `Commands` by name, and where its answer goes."""
+
+    name: str
+    arguments: dict[str, Any]
+    future: Future[Any]
 
 
 class ControlLoop:
@@ -38,7 +54,9 @@ class ControlLoop:
     def __init__(self, config: Config, link: RoomLink) -> None:
         self._config = config
         self._link = link
-        self._queue: queue.Queue[tuple[Callable[[], Any], Future[Any]]] = queue.Queue()
+        self._link.client.while_moving = self._while_moving
+        self._queue: queue.Queue[_Asked] = queue.Queue()
+        self._published_change = (0, 0)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="control", daemon=True)
         self._published_at_s = 0.0
@@ -64,17 +82,26 @@ class ControlLoop:
         self._thread.join(timeout=10.0)
 
     def call(self, name: str, arguments: Mapping[str, Any]) -> Any:
-        """Carry out a command of `Commands` in the loop's thread and return what it returns."""
-        future: Future[Any] = Future()
-        self._queue.put((lambda: getattr(self._commands, name)(**arguments), future))
-        return future.result(timeout=30.0)
+        """Carry out a command of `Commands` in the loop's thread and return what it returns.
+
+        Raises what the command raises, and TimeoutError if the loop did not come to it; it is then
+        not carried out later either.
+        """
+        if self._failure is not None:
+            raise ConflictError("control_loop", f"The control loop ended: {self._failure}")
+        asked = _Asked(name, dict(arguments), Future())
+        self._queue.put(asked)
+        try:
+            return asked.future.result(timeout=_PATIENCE_S)
+        except TimeoutError:
+            if asked.future.cancel():
+                raise
+            return asked.future.result(timeout=_PATIENCE_S)
 
     def stop(self, by: str, *, emergency: bool = False) -> None:
         """Stop the robot now, from any thread; the procedure that runs is aborted."""
         self._link.client.request_stop(emergency=emergency)
-        if self._commands is not None:
-            note = partial(self._commands.note_stop, by, emergency)
-            self._queue.put((note, Future()))
+        self._queue.put(_Asked("note_stop", {"by": by, "emergency": emergency}, Future()))
 
     # From here on everything runs in the loop's own thread
 
@@ -82,6 +109,8 @@ class ControlLoop:
         try:
             with CaseRecord(self._config.room.case_dir, create=True) as record:
                 self._serve(record)
+        except _Closing:
+            pass
         except BaseException as error:
             self._failure = error
             log.exception("control loop ended")
@@ -94,6 +123,7 @@ class ControlLoop:
         execution = Execution(self._config, record, self._link, self._tick)
         self._commands = Commands(self._config, record, self._link, execution)
         self._record, self._execution = record, execution
+        self._describer = Describer(self._config, record, self._link)
         while not self._closing.is_set():
             self._tick()
             running = record.running_procedure()
@@ -130,35 +160,51 @@ class ControlLoop:
         if self._closing.is_set():
             raise _Closing
         self._link.pump(_TICK_S)
-        while True:
-            try:
-                command, future = self._queue.get_nowait()
-            except queue.Empty:
-                break
-            _answer(command, future)
-            self._publish()
+        self._answer_queue()
         if self._commands is not None:
             self._commands.keep_lock()
-        if time.monotonic() - self._published_at_s > _PUBLISH_EVERY_S:
+        self._publish_if_due()
+
+    def _while_moving(self) -> None:
+        """Called by the link again and again while it waits for the end of a motion."""
+        self._answer_queue(moving=True)
+        self._publish_if_due()
+
+    def _answer_queue(self, *, moving: bool = False) -> None:
+        while self._commands is not None:
+            try:
+                asked = self._queue.get_nowait()
+            except queue.Empty:
+                return
+            _answer(self._commands, asked, moving)
+            self._publish()
+
+    def _publish_if_due(self) -> None:
+        since_s = time.monotonic() - self._published_at_s
+        if since_s < _LEAST_BETWEEN_STATES_S:
+            return
+        if since_s > _PUBLISH_EVERY_S or self._record.change_count() != self._published_change:
             self._publish()
 
     def _publish(self) -> None:
         self._published_at_s = time.monotonic()
-        if self._commands is not None:
-            self._state = describe(
-                self._config, self._record, self._link, self._execution, self._state
-            )
+        self._published_change = self._record.change_count()
+        self._state = self._describer.describe(self._execution, self._state)
 
 
 class _Closing(Exception):
     """The loop is asked to end; what runs stays as it is recorded."""
 
 
-def _answer(command: Callable[[], Any], future: Future[Any]) -> None:
+def _answer(commands: Commands, asked: _Asked, moving: bool) -> None:
+    if not asked.future.set_running_or_notify_cancel():
+        return  # whoever asked has given up waiting: not carried out
     try:
-        future.set_result(command())
-    except ConflictError as error:
-        future.set_exception(error)
+        if moving and asked.name not in _WHILE_MOVING:
+            raise ConflictError("moving", "The robot moves: wait until it stands, or press STOP.")
+        asked.future.set_result(getattr(commands, asked.name)(**asked.arguments))
+    except (ConflictError, CaseRecordError) as error:
+        asked.future.set_exception(error)
     except Exception as error:
-        log.exception("command failed")
-        future.set_exception(error)
+        log.exception("command failed", command=asked.name)
+        asked.future.set_exception(error)

@@ -31,6 +31,12 @@ from service.steps import (
 _SERVICE = "service"
 
 
+def _phase_of(purpose: str) -> WorkPhase:
+    if "calib" in purpose:
+        return WorkPhase.CALIBRATION
+    return WorkPhase.MANUAL if purpose == "manual" else WorkPhase.MOVE_TO_TARGET
+
+
 class ProcedureAbortedError(Exception):
     """The operator ended the procedure, or STOP did. The robot stands still."""
 
@@ -95,7 +101,7 @@ class Execution:
     # Moves
 
     def _move(self, step: MoveTo, command_id: str) -> Moved:
-        phase = WorkPhase.CALIBRATION if "calib" in step.purpose else WorkPhase.MOVE_TO_TARGET
+        phase = _phase_of(step.purpose)
         measurement = None if step.rests_on is None else str(step.rests_on)
         while True:
             self._wait_until_ready_to_move()

@@ -8,19 +8,30 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 from service.control import ControlLoop
+from service.live import Broadcast
 from service.room_link import RoomLink
 
 
 class RoomMetrics(Collector):
-    def __init__(self, loop: ControlLoop, link: RoomLink) -> None:
+    def __init__(self, loop: ControlLoop, link: RoomLink, broadcast: Broadcast) -> None:
         self._loop = loop
         self._link = link
+        self._broadcast = broadcast
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
         state = self._loop.state
         yield GaugeMetricFamily(
             "autospine_robot_linked", "1 while the bridge answers.", value=float(state.robot.linked)
         )
+        yield GaugeMetricFamily(
+            "autospine_viewers", "Open event streams.", value=float(self._broadcast.viewers)
+        )
+        parts = GaugeMetricFamily(
+            "autospine_process_up", "1 while a process of the room works.", labels=["process"]
+        )
+        for process in state.processes:
+            parts.add_metric([process.name], float(process.condition == "up"))
+        yield parts
         slices = GaugeMetricFamily("autospine_slices", "Slices by state.", labels=["state"])
         for name, count in state.slices.items():
             slices.add_metric([name], count)

@@ -10,10 +10,12 @@ from case_record.record import CaseRecord
 from case_record.rows import Procedure
 from service.approach import ApproachArguments, Arrival, approach
 from service.calibration import Calibration, CalibrationArguments, calibrate
+from service.jog import JogEnd, jog
 from service.steps import ProcedureSteps
 
 CALIBRATION = "calibration"
 APPROACH = "approach"
+JOG = "jog"
 
 
 def build_procedure(row: Procedure) -> ProcedureSteps[Any]:
@@ -29,7 +31,7 @@ def approach_arguments(arguments: ApproachArguments, start: Calibration) -> dict
     return {"arguments": asdict(arguments), "start": start.to_json()}
 
 
-def result_to_json(result: Calibration | Arrival) -> dict[str, Any]:
+def result_to_json(result: Calibration | Arrival | JogEnd) -> dict[str, Any]:
     return result.to_json()
 
 
@@ -64,4 +66,5 @@ def _build_approach(value: Mapping[str, Any]) -> ProcedureSteps[Arrival]:
 _BUILDERS: dict[str, Callable[[Mapping[str, Any]], ProcedureSteps[Any]]] = {
     CALIBRATION: _build_calibration,
     APPROACH: _build_approach,
+    JOG: lambda value: jog(value["setpoints_um"]),
 }

@@ -7,6 +7,7 @@ import json
 import os
 import signal
 import socket
+import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -23,6 +24,7 @@ ConfigOption = Annotated[Path, typer.Option("--config", help="The room's TOML fi
 ParentOption = Annotated[
     bool, typer.Option("--exit-with-parent", help="End when standard input is closed.")
 ]
+_SWITCH_INTERVAL_S = 0.001
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
@@ -32,16 +34,37 @@ def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> Non
 
     configure_logs()
     room = load_config(config)
+    check_device(room.service.bridge_link)
     listening = bind(room)
     host, port = listening.getsockname()[:2]
-    url = f"http://{host}:{port}"
+    scheme = "http" if room.service.tls_certificate is None else "https"
+    url = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
     app = create_app(room, announce=lambda: announce({"url": url}))
+    # the control loop must not wait long for the interpreter while a page is being served
+    sys.setswitchinterval(_SWITCH_INTERVAL_S)
     server = uvicorn.Server(
-        uvicorn.Config(app, log_level="warning", access_log=False, timeout_graceful_shutdown=1)
+        uvicorn.Config(
+            app,
+            log_level="warning",
+            access_log=False,
+            server_header=False,
+            timeout_graceful_shutdown=1,
+            ssl_certfile=room.service.tls_certificate,
+            ssl_keyfile=room.service.tls_key,
+        )
     )
+    _check_tls(server)
     if exit_with_parent:
         on_parent_gone(lambda: setattr(server, "should_exit", True))
     server.run(sockets=[listening])
+
+
+def _check_tls(server: uvicorn.Server) -> None:
+    """ConfigError instead of a traceback where certificate or key cannot be used."""
+    try:
+        server.config.load()
+    except OSError as error:  # ssl.SSLError is one
+        raise ConfigError(f"service.tls_certificate, service.tls_key: {error}") from None
 
 
 def worker(config: ConfigOption, exit_with_parent: ParentOption = False) -> None:
@@ -62,16 +85,27 @@ def worker(config: ConfigOption, exit_with_parent: ParentOption = False) -> None
 def bind(room: Config) -> socket.socket:
     """Return the listening socket of the page; ConfigError if that cannot be."""
     host, port = room.service.host, room.service.port
-    if host not in _LOOPBACK:
-        raise ConfigError(f"key service.host: {host} is not loopback; tokens are needed for that")
+    if host not in _LOOPBACK and not room.service.token:
+        raise ConfigError(
+            f"key service.host: {host} is not loopback: add [[service.token]] tables "
+            "(`autospine token NAME` makes one), or listen on 127.0.0.1"
+        )
     listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    if host not in _LOOPBACK and room.service.tls_certificate is None:
+        structlog.get_logger().warning("tokens travel unencrypted: set service.tls_certificate")
     try:
         listening.bind((host, port))
     except OSError as error:
         listening.close()
         raise ConfigError(f"service port {host}:{port}: {error.strerror}") from None
     return listening
+
+
+def check_device(link: str) -> None:
+    """ConfigError if the line to the bridge is a device that does not exist."""
+    if "://" not in link and not Path(link).exists():
+        raise ConfigError(f"key service.bridge_link: there is no device {link}")
 
 
 def announce(facts: dict[str, object]) -> None:

@@ -5,18 +5,44 @@ from __future__ import annotations
 import time
 from collections import deque
 from collections.abc import Callable
+from typing import Any
 
-from robot_bridge.client import BridgeClient, BridgeError, BridgeStatus, LinkLostError
+from robot_bridge.client import (
+    BridgeClient,
+    BridgeError,
+    BridgeStatus,
+    LinkLostError,
+    MoveOutcome,
+)
 from robot_bridge.phases import ALLOWED, WorkPhase
 
 _REOPEN_EVERY_S = 0.5
 _OPEN_TIMEOUT_S = 1.0
 
 
+class PumpedClient(BridgeClient):
+    """Calls `while_moving` again and again while a motion blocks the loop that asked for it."""
+
+    while_moving: Callable[[], None] = staticmethod(lambda: None)
+    _in_motion = False
+
+    def move(self, *args: Any, **kwargs: Any) -> MoveOutcome:
+        self._in_motion = True
+        try:
+            return super().move(*args, **kwargs)
+        finally:
+            self._in_motion = False
+
+    def pump(self, wait_s: float = 0.0) -> None:
+        super().pump(wait_s)
+        if self._in_motion:
+            self.while_moving()
+
+
 class RoomLink:
     """A bridge client that is opened again by itself when the line or the bridge was lost."""
 
-    def __init__(self, client: BridgeClient, on_change: Callable[[str], None]) -> None:
+    def __init__(self, client: PumpedClient, on_change: Callable[[str], None]) -> None:
         self.client = client
         self._on_change = on_change
         self._next_open_s = 0.0

@@ -13,7 +13,7 @@ import typer
 
 from room_config.load import ConfigError, read_toml
 from simulator.config import VirtualRoom, VirtualRoomError, parse_virtual_room
-from simulator.scanner import operate
+from simulator.scan_operator import operate
 
 BAD_INPUT = 2
 

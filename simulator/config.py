@@ -23,13 +23,21 @@ class VirtualRoomError(ValueError):
 
 
 class _Table(BaseModel):
-    model_config = ConfigDict(extra="forbid", frozen=True, strict=True, allow_inf_nan=False)
+    # The text below a field is its description, in the documentation as well.
+    model_config = ConfigDict(
+        extra="forbid",
+        frozen=True,
+        strict=True,
+        allow_inf_nan=False,
+        use_attribute_docstrings=True,
+    )
 
 
 class Placement(_Table):
     """How the robot stands on the table, and how true its stages are."""
 
     origin_mm: Vector = (5.3, 58.0, -17.6)
+    """Patient position (LPS) of the robot's origin."""
     rotation_deg: Annotated[float, Field(gt=-180, le=180)] = 1.5
     """About the robot's z. At 0, robot x is patient left and robot y is patient inferior."""
     tilt_deg: tuple[float, float] = (0.3, -0.2)
@@ -39,7 +47,9 @@ class Placement(_Table):
     skew_deg: Annotated[float, Field(gt=-45, lt=45)] = 0.15
     """How far the angle between the two axes of travel is from 90°."""
     top_plane_mm: float = 0.0
+    """Height (robot z) of the ball joint of the top stage."""
     bottom_plane_mm: float = -60.0
+    """Height (robot z) of the ball joint of the bottom stage."""
 
     @model_validator(mode="after")
     def _planes_are_apart(self) -> "Placement":
@@ -52,6 +62,7 @@ class Fiducial(_Table):
     """A sphere of vitamin E in a polymer shell."""
 
     name: Annotated[str, Field(min_length=1)] = "upper"
+    """By which the truth file calls it."""
     mount: Literal["top_stage", "guide"] = "top_stage"
     """`top_stage`: rides on it (2 DOF); `guide`: on the cannula between the ball joints (4 DOF)."""
     offset_mm: Vector = (0.0, 0.0, 0.0)
@@ -59,16 +70,22 @@ class Fiducial(_Table):
     along_guide_mm: float = 0.0
     """guide only: distance from the lower ball joint, in which the cannula is fixed."""
     radius_mm: Positive = 4.0
+    """Of the oil."""
     shell_mm: Annotated[float, Field(ge=0)] = 1.5
+    """Thickness of the shell."""
     signal: Positive = 1.0
+    """Of the oil."""
     shell_signal: Annotated[float, Field(ge=0)] = 0.0
+    """Of the shell: printed polymer gives none."""
 
 
 class StaticObject(_Table):
     """Something that lies on the table and does not move with the robot (water, not oil)."""
 
     kind: Literal["box", "cylinder", "sphere"]
+    """Its shape."""
     centre_mm: Vector
+    """Patient position (LPS)."""
     size_mm: tuple[Positive, Positive, Positive] | None = None
     """box only: full edges along the patient's x, y, z."""
     radius_mm: Positive | None = None
@@ -78,6 +95,7 @@ class StaticObject(_Table):
     axis: Literal["x", "y", "z"] = "y"
     """cylinder only: the patient axis along which it lies."""
     signal: Annotated[float, Field(ge=0)] = 0.6
+    """Of its water."""
 
     @model_validator(mode="after")
     def _has_its_dimensions(self) -> "StaticObject":
@@ -110,13 +128,16 @@ class SliceProtocol(_Table):
     """What the scanner's operator has set: field of view, contrast, filters, noise."""
 
     orientation: Literal["coronal", "axial", "sagittal"] = "coronal"
+    """Plane of the slices."""
     shape: tuple[Annotated[int, Field(ge=16, le=1024)], Annotated[int, Field(ge=16, le=1024)]] = (
         128,
         128,
     )
+    """Rows, columns."""
     spacing_mm: tuple[Positive, Positive] = (1.0, 1.0)
     """Between rows, between columns."""
     thickness_mm: Positive = 3.0
+    """Of the slice; its profile is rectangular."""
     fov_centre_mm: Vector = (5.0, 58.0, -18.0)
     """Patient position of the middle of the field of view of the slice at its default position."""
     phase_encoding: Literal["ROW", "COL"] = "COL"
@@ -124,7 +145,7 @@ class SliceProtocol(_Table):
     window: Literal["flat", "hamming", "fermi", "elliptical"] = "flat"
     """The filter in k-space."""
     snr: Positive = 30.0
-    """Signal 1 over the noise of one channel (real or imaginary) in the image."""
+    """Signal 1 over the noise of one channel (real or imaginary) before the filter."""
     shading_per_mm: tuple[float, float] = (0.0006, -0.0009)
     """Relative slope of the receive sensitivity along rows and columns, from the middle."""
     shading_per_mm2: float = -6.0e-6
@@ -132,57 +153,89 @@ class SliceProtocol(_Table):
     stored_per_signal: Positive = 1000.0
     """Stored pixel value of signal 1."""
     field_t: Positive = 3.0
+    """Main field."""
     imaging_frequency_mhz: Positive = 123.2
+    """Larmor frequency of water."""
     bandwidth_hz_px: Positive = 260.0
+    """Receive bandwidth of one pixel."""
     readout_polarity: Literal[-1, 1] = 1
+    """Sign of the readout gradient: to which side oil is displaced."""
     chemical_shift_ppm: Annotated[float, Field(ge=0)] = 0.0
     """Oil against water: 3.4 in a real room; 0 leaves the fiducial where it is."""
     echo_time_ms: Positive = 0.9
+    """As the header says it."""
     flip_angle_deg: Positive = 12.0
+    """As the header says it."""
 
 
 class ScannerSettings(_Table):
     """The scanner as a DICOM node with a clock and an operator of its own."""
 
-    service_url: str
+    service_url: Annotated[str, Field(pattern=r"^https?://[^\s/]+")]
+    """Address of the service, which says what to acquire next."""
     listener_host: str = "127.0.0.1"
+    """Where slices are sent to."""
     listener_port: Port
+    """DICOM port of the listener."""
     listener_ae_title: AeTitle = "AUTOSPINE"
+    """Called AE title."""
     ae_title: AeTitle = "VIRTUALMR"
+    """Calling AE title, and the station's name."""
     motors_truth_host: str = "127.0.0.1"
+    """Where the emulated motors tell the truth about the stages."""
     motors_truth_port: Port
+    """Port of that."""
     truth_file: str
-    """JSON lines, appended: the truth of each acquisition."""
+    """JSON lines, appended: the truth of each acquisition. Relative to the configuration."""
     acquisition_s: Positive = 0.25
+    """How long a slice takes."""
     gap_s: Annotated[float, Field(ge=0)] = 0.02
     """Between two slices of one request."""
     reconstruction_s: Annotated[float, Field(ge=0)] = 0.15
+    """From the end of an acquisition until its slice is sent."""
     poll_s: Positive = 0.05
+    """How often the operator looks at what to acquire."""
     retry_s: Positive = 0.5
+    """From a failed delivery until the next attempt."""
     retries: Annotated[int, Field(ge=0)] = 20
+    """Attempts after the first."""
     clock_offset_s: float = 37.2
     """The scanner's clock minus ours."""
     clock_drift_ppm: float = 0.0
+    """How much faster the scanner's clock runs than ours."""
     utc_offset_min: Annotated[int, Field(ge=-14 * 60, le=14 * 60)] = 0
-    """The scanner writes local time."""
+    """The scanner writes local time: so many minutes ahead of UTC."""
     write_timezone: bool = True
+    """Whether the header says so (TimezoneOffsetFromUTC)."""
     time_attributes: Literal["datetime", "date_and_time", "both"] = "both"
+    """AcquisitionDateTime, AcquisitionDate with AcquisitionTime, or both; classic images only."""
     sop_class: Literal["classic", "enhanced"] = "classic"
+    """MR Image or Enhanced MR Image."""
     manufacturer: str = "AutoSPINe Virtual MR"
+    """As the header says it."""
     model_name: str = "Virtual 3T"
+    """As the header says it."""
 
 
 class VirtualRoom(_Table):
     """Everything that the virtual room is made of."""
 
     seed: Annotated[int, Field(ge=0)] = 0
+    """Of noise and faults."""
     placement: Placement = Placement()
+    """Where the robot stands."""
     fiducials: Annotated[tuple[Fiducial, ...], Field(min_length=1)] = (Fiducial(),)
+    """One for two degrees of freedom, two on the guide for four."""
     background: tuple[StaticObject, ...] = BACKGROUND
+    """What else lies in the field of view; by default a water phantom and two tubes."""
     protocol: SliceProtocol = SliceProtocol()
+    """How slices are acquired."""
     scanner: ScannerSettings | None = None
+    """The scanner as a process; not needed for studies."""
     faults: tuple[str, ...] = ()
+    """Names of what goes wrong."""
     fault_probability: Annotated[float, Field(ge=0, le=1)] = 0.3
+    """That each of them befalls an acquisition."""
     motors: dict[str, Any] = {}
     """Not read here: the emulated motor controllers check their own table."""
 

@@ -156,6 +156,8 @@ class DemoRoom:
                 # as if the clocks had been compared at the console, to a fiftieth of a second
                 "clock_offset_s": -_CLOCK_OFFSET_S,
                 "clock_uncertainty_s": 0.02,
+                # the virtual scanner reconstructs in 0.15 s and sends at once
+                "prompt_delay_s": 0.3,
             },
             "service": {
                 "port": page_port,

@@ -30,13 +30,14 @@ class Study:
 
     study_uid: str
     frame_of_reference_uid: str
+    dimension_organization_uid: str
     started_s: float
     patient_id: str = "VIRTUAL-1"
     patient_name: str = "Phantom^Virtual"
 
     @classmethod
     def new(cls, started_s: float) -> "Study":
-        return cls(generate_uid(), generate_uid(), started_s)
+        return cls(generate_uid(), generate_uid(), generate_uid(), started_s)
 
 
 @dataclass(frozen=True)

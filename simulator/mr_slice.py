@@ -246,10 +246,9 @@ def _sensitivity(geometry: SliceGeometry, protocol: SliceProtocol) -> Floats:
 
 
 def _noise(shape: tuple[int, int], protocol: SliceProtocol, rng: np.random.Generator) -> Complex:
-    """Noise of std 1/snr a channel in the image; the filter colours it, as it does on a scanner."""
+    """Noise of std 1/snr a channel; a filter lowers and colours it, as it does on a scanner."""
     white = rng.standard_normal((2, *shape)) / protocol.snr
     noise = white[0] + 1j * white[1]
     if protocol.window == "flat":
         return noise
-    window = _window(shape, protocol.window)
-    return np.fft.ifft2(np.fft.fft2(noise) * window) / np.sqrt(np.mean(window**2))
+    return np.fft.ifft2(np.fft.fft2(noise) * _window(shape, protocol.window))

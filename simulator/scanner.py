@@ -1,34 +1,31 @@
-"""The virtual scanner and the person who operates it.
+"""The virtual scanner: real seconds pass while it acquires, and it has a clock of its own.
 
-It watches the service for what is to be acquired next, as the operator reads it off the page;
-acquires (real seconds pass, the stages are wherever they truly are meanwhile); and sends what it
-has reconstructed by C-STORE, stamped with a clock of its own. Whatever it acquires is written
-down with its truth.
+The stages are wherever they truly are meanwhile. What it has reconstructed goes to the outbox, and
+whatever it acquires is written down with its truth.
 """
 
-import json
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import asdict, dataclass
-from pathlib import Path
+from dataclasses import dataclass
 from typing import Any
 
-import httpx
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import BaseModel, ConfigDict, Field
 from pydicom.dataset import Dataset
 
 from simulator.config import ScannerSettings, VirtualRoom, VirtualRoomError
 from simulator.dicom_writer import AcquisitionStamp, Series, Study, write_mr_image
+from simulator.enhanced_writer import write_enhanced_mr_image
 from simulator.faults import corrupt, distorted, jumped_clock_s, phase_of, strike
 from simulator.mr_slice import AcquiredSlice, StagePath, acquire
-from simulator.outbox import Delivery, Outbox
+from simulator.outbox import Outbox
 from simulator.truth_client import TruthAddress, TruthError, ask_path, ask_where
+from simulator.truth_file import TruthFile
 
 Note = Callable[[str], None]
 
-_HELD_BACK_AT_MOST_S = 5.0
+_HELD_BACK_AT_MOST_S = 2.5
 _DUPLICATE_AFTER_S = 0.1
 
 
@@ -53,30 +50,6 @@ class Scan:
     ended_s: float
     slice: AcquiredSlice
     faults: frozenset[str]
-
-
-class TruthFile:
-    """JSON lines, appended: each acquisition with its truth, each delivery that failed."""
-
-    def __init__(self, path: Path) -> None:
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self.earlier_lines = path.read_bytes().count(b"\n") if path.exists() else 0
-            self._file = path.open("a", encoding="utf-8")
-        except OSError as error:
-            raise VirtualRoomError(
-                f"virtual.scanner.truth_file: {path}: {error.strerror}"
-            ) from None
-        self._lock = threading.Lock()
-
-    def write(self, kind: str, **entry: Any) -> None:
-        line = json.dumps({"kind": kind, **entry}, default=_plain)
-        with self._lock:
-            self._file.write(line + "\n")
-            self._file.flush()
-
-    def close(self) -> None:
-        self._file.close()
 
 
 class VirtualScanner:
@@ -123,7 +96,9 @@ class VirtualScanner:
             self._send(scan, series)
 
     def scan_if_moving(self, stop: threading.Event) -> bool:
-        """Acquire without having been asked if the robot is just moving; whether it did so."""
+        """With the fault: acquire unasked if the robot is just moving; whether it did so."""
+        if "motion_during_scan" not in self._room.faults:
+            return False
         if not ask_where(self._address).moving or not self._strikes("motion_during_scan"):
             return False
         scan = self._scan(None, 0, stop, frozenset({"motion_during_scan"}))
@@ -151,12 +126,13 @@ class VirtualScanner:
         started_s, began_s = time.time(), time.monotonic()
         stop.wait(self._settings.acquisition_s)
         ended_s = started_s + time.monotonic() - began_s
+        axial = "wrong_orientation" in faults
         acquired = acquire(
             self._room,
             self._path(started_s, ended_s),
             self._noise,
-            slice_position_mm=request.slice_position_mm if request else None,
-            orientation="axial" if "wrong_orientation" in faults else None,
+            slice_position_mm=request.slice_position_mm if request and not axial else None,
+            orientation="axial" if axial else None,
             interval_s=(started_s, ended_s),
         )
         return Scan(request, index, started_s, ended_s, acquired, faults)
@@ -230,7 +206,9 @@ class VirtualScanner:
             instance_number=scan.index + 1,
             reconstructed_s=self.clock_s(scan.ended_s) + self._settings.reconstruction_s,
         )
-        return write_mr_image(
+        enhanced = self._settings.sop_class == "enhanced"
+        write = write_enhanced_mr_image if enhanced else write_mr_image
+        return write(
             pixels,
             scan.slice.geometry,
             protocol=(room or self._room).protocol,
@@ -277,83 +255,5 @@ class VirtualScanner:
         )
 
 
-def read_request(http: httpx.Client, service_url: str) -> AcquisitionRequest | None:
-    """What the service asks for now. Raises httpx.HTTPError or ValueError (not understood)."""
-    answer = http.get(f"{service_url.rstrip('/')}/api/v1/state")
-    answer.raise_for_status()
-    state = answer.json()
-    if not isinstance(state, dict) or "acquisition_request" not in state:
-        raise ValueError("the state has no field 'acquisition_request'")
-    if state["acquisition_request"] is None:
-        return None
-    try:
-        return AcquisitionRequest.model_validate(state["acquisition_request"])
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        key = ".".join(str(part) for part in first["loc"])
-        raise ValueError(f"acquisition_request.{key}: {first['msg']}") from None
-
-
-def operate(
-    room: VirtualRoom,
-    stop: threading.Event,
-    note: Note,
-    ready: Callable[[], None] = lambda: None,
-) -> None:
-    """Play the scanner and its operator until `stop` is set; `ready` is called once it begins.
-
-    Raises VirtualRoomError if the room has no scanner or the truth file cannot be written.
-    """
-    if room.scanner is None:
-        raise VirtualRoomError("virtual.scanner: missing table")
-    settings = room.scanner
-    truth = TruthFile(Path(settings.truth_file))
-    say = _once_in_a_row(note)
-
-    def report(delivery: Delivery) -> None:
-        truth.write("delivery", **asdict(delivery))
-        if not delivery.sent:
-            note(f"{delivery.sop_instance_uid} could not be delivered: {delivery.reason}")
-
-    served: set[str] = set()
-    with httpx.Client(timeout=2.0, trust_env=False) as http, Outbox(settings, report) as outbox:
-        scanner = VirtualScanner(room, truth, outbox, say)
-        ready()
-        while not stop.wait(settings.poll_s):
-            try:
-                request = read_request(http, settings.service_url)
-                if request is not None and request.request_id not in served:
-                    scanner.serve(request, stop)
-                    served.add(request.request_id)
-                elif "motion_during_scan" in room.faults:
-                    scanner.scan_if_moving(stop)
-                scanner.release_held_back()
-                say("")
-            except TruthError as error:
-                say(str(error))
-            except (httpx.HTTPError, ValueError) as error:
-                say(f"{settings.service_url}: {error}")
-    truth.close()
-
-
-def _once_in_a_row(note: Note) -> Note:
-    """The same line is said once, until something else has been said; '' says nothing."""
-    last = ""
-
-    def say(line: str) -> None:
-        nonlocal last
-        if line and line != last:
-            note(line)
-        last = line
-
-    return say
-
-
 def _localizer_protocol(room: VirtualRoom) -> Any:
     return room.protocol.model_copy(update={"spacing_mm": (2.5, 2.5), "thickness_mm": 8.0})
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, np.ndarray):
-        return value.tolist()
-    raise TypeError(f"{type(value).__name__} cannot be written as JSON")

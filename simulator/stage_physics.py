@@ -47,11 +47,27 @@ class StageParameters:
     def __post_init__(self) -> None:
         if self.mounting not in (1, -1):
             raise ValueError(f"mounting {self.mounting} is neither 1 nor -1")
-        if not 0 < self.step_um < 20:
-            raise ValueError(f"step_um {self.step_um} is outside 0..20 um")
+        for name, low, high in _BOUNDS:
+            value = getattr(self, name)
+            if not low <= value <= high:
+                raise ValueError(f"{name} {value} is outside {low}..{high}")
         if not self.travel_um[0] < self.travel_um[1]:
             raise ValueError(f"travel_um {self.travel_um} is empty")
 
+
+_BOUNDS = (
+    ("step_um", 0.1, 20.0),
+    ("asymmetry", -0.5, 0.5),
+    ("load", -2.0, 2.0),
+    ("load_per_mm", -1.0, 1.0),
+    ("load_slope", 0.0, 1.0),
+    ("frequency_slope", 0.0, 0.2),
+    ("reference_hz", 1.0, 10_000.0),
+    ("scatter", 0.0, 0.2),
+    ("repeatability_um", 0.0, 1000.0),
+    ("park_shift_um", 0.0, 1000.0),
+    ("encoder_noise_um", 0.0, 100.0),
+)
 
 # The additive error of a run has come in full after this distance.
 REPEATABILITY_DISTANCE_UM = 100.0

@@ -19,6 +19,7 @@ from sr_engine.checks import (
     checked_shifts,
     refuse_saturated,
 )
+from sr_engine.detect import detect
 from sr_engine.errors import (
     AmbiguousObjectError,
     InconsistentFramesError,
@@ -40,7 +41,7 @@ Array = NDArray[np.float64]
 MARGIN_PX = 4.0  # of surroundings that are fitted with the object
 SEARCH_PX = 3.0  # how far from a given start the object may be
 DEFAULT_RADII_PX = (1.5, 12.0)
-MINIMUM_SCORE = 0.5  # of the matched filter
+LEAST_EXPLAINED = 0.3  # of the variance near a given start, by the matched filter
 AMBIGUOUS_RATIO = 0.9  # a second candidate of this share of the best score is as good
 MINIMUM_EXPLAINED = 60.0  # chi2 that an object must take away to be one
 CONSISTENCY_P = 1e-5  # frames that agree look as bad as this once in 100,000 measurements
@@ -104,6 +105,8 @@ def localize(
       May be left out for one frame.
     start_px: where the object is in the reference pose, to within 3 px; else it is looked for.
     radius_px: (low, high), or one number within 25 %; default 1.5 to 12 px.
+    method: "ml", or one of the paper's, "sr", "bicubic", "base" (see `paper`), which heed
+      start_px, radius_px, gate_px and saturation_level alone.
     psf: point spread; default flat k-space. noise: "rician", or "gaussian" (default for a psf
       that folds, a camera). sigma: noise std per channel where known.
     shift_sigma_px: std per axis of a frame's shift (the motor's repeatability).
@@ -112,8 +115,16 @@ def localize(
 
     Raises a subclass of EngineError; never returns a centre that it does not stand for.
     """
+    if method in ("base", "bicubic", "sr"):
+        # Loaded here: the paper's methods answer with this module's Localization.
+        from sr_engine.paper import localize_paper
+
+        return localize_paper(
+            frames, shifts_px, method, start_px=start_px, radius_px=radius_px, gate_px=gate_px,
+            saturation_level=saturation_level,
+        )  # fmt: skip
     if method != "ml":
-        raise ParameterError(f"unknown method '{method}' here, known: ml")
+        raise ParameterError(f"unknown method '{method}', known: ml, sr, bicubic, base")
     stack = checked_frames(frames)
     shifts = checked_shifts(shifts_px, len(stack))
     radii = checked_radii(radius_px) or DEFAULT_RADII_PX
@@ -187,7 +198,7 @@ def _first_guess(
 ) -> tuple[float, float, float]:
     """(row, col, radius) in the reference pose, from the matched filter on the first frame."""
     if start is None:
-        centre, radius = _search(frame, (0, 0), radii, unique=True)
+        centre, radius = _search(frame, radii)
     else:
         expected = (start[0] + shift[0], start[1] + shift[1])
         inside = all(-0.5 <= x <= n - 0.5 for x, n in zip(expected, frame.shape, strict=True))
@@ -205,13 +216,12 @@ def _search_near(
     reach = int(np.ceil(radii[1] + MARGIN_PX + SEARCH_PX))
     r0, c0 = (max(0, round(x) - reach) for x in expected)
     part = frame[r0 : round(expected[0]) + reach + 1, c0 : round(expected[1]) + reach + 1]
-    grid = radius_grid(*radii, step_px=1.0)
-    scores = correlate(part, grid)
+    found = correlate(part, radius_grid(*radii, step_px=1.0))
     rows, cols = np.indices(part.shape)
     far = np.hypot(rows + r0 - expected[0], cols + c0 - expected[1]) > SEARCH_PX
-    scores[:, far] = 0.0
-    match = best_matches(scores, grid, 1, 1.0)
-    if not match or abs(match[0].score) < MINIMUM_SCORE:
+    found.explained[:, far] = 0.0
+    match = best_matches(found, 1, 1.0, LEAST_EXPLAINED)
+    if not match:
         raise NoRoundObjectError(
             f"no round object within {SEARCH_PX:g} px of row {expected[0]:.1f}, "
             f"col {expected[1]:.1f}"
@@ -220,25 +230,20 @@ def _search_near(
     return (row + r0, col + c0), match[0].radius_px
 
 
-def _search(
-    frame: Array, origin: tuple[int, int], radii: tuple[float, float], unique: bool
-) -> tuple[tuple[float, float], float]:
-    grid = radius_grid(*radii)
-    matches = best_matches(correlate(frame, grid), grid, 2, apart_px=2 * radii[0])
-    if not matches or abs(matches[0].score) < MINIMUM_SCORE:
+def _search(frame: Array, radii: tuple[float, float]) -> tuple[tuple[float, float], float]:
+    """The one round object of the frame."""
+    found = detect(frame, radii, max_objects=2)
+    if not found:
         raise NoRoundObjectError(
             f"no round object of radius {radii[0]:.1f} to {radii[1]:.1f} px stands out"
         )
-    best = matches[0]
-    if unique and len(matches) > 1:
-        second = matches[1]
-        if abs(second.score) > AMBIGUOUS_RATIO * abs(best.score):
-            raise AmbiguousObjectError(
-                f"two round objects are equally good, at row {best.centre_px[0]:.1f} col "
-                f"{best.centre_px[1]:.1f} and at row {second.centre_px[0]:.1f} col "
-                f"{second.centre_px[1]:.1f}: give a start or a narrower radius range"
-            )
-    return (best.centre_px[0] + origin[0], best.centre_px[1] + origin[1]), best.radius_px
+    if len(found) > 1 and found[1].strength > AMBIGUOUS_RATIO * found[0].strength:
+        (row0, col0), (row1, col1) = found[0].centre_px, found[1].centre_px
+        raise AmbiguousObjectError(
+            f"two round objects are equally good, at row {row0:.1f} col {col0:.1f} and at row "
+            f"{row1:.1f} col {col1:.1f}: give a start or a narrower radius range"
+        )
+    return found[0].centre_px, found[0].radius_px
 
 
 def _refuse_doubtful(

@@ -9,13 +9,14 @@ no error estimate of its own; the covariance reported is the paper's measured me
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from sr_engine.blur import Blur
+from sr_engine.checks import checked_radii, refuse_saturated
 from sr_engine.errors import (
     AmbiguousObjectError,
     InconsistentFramesError,
@@ -40,8 +41,12 @@ PAPER_MEAN_ERROR_PX = {"base": 0.156, "bicubic": 0.135, "sr": 0.066}
 
 DEFAULT_RADII_PX = (2.0, 12.0)
 SEARCH_PX = 3.0
+SEARCHED_BEYOND = 1.5
 MARGIN_PX = 6.0
 AMBIGUOUS_RATIO = 0.95
+MIN_CONTRAST = 2.5
+"""Of the disc against its surroundings, in standard deviations of the noise: a Hough transform
+finds circles in noise as well."""
 MAX_RESIDUAL_PX = 1.0
 """A frame whose own circle lies farther off than this was not taken at its shift."""
 
@@ -63,10 +68,12 @@ class PaperSettings:
 def localize_paper(
     frames: ArrayLike,
     shifts_px: ArrayLike | None = None,
-    method: PaperMethod = "sr",
+    method: str = "sr",
     *,
     start_px: ArrayLike | None = None,
+    radius_px: tuple[float, float] | float | None = None,
     gate_px: float | None = None,
+    saturation_level: float | None = None,
     settings: PaperSettings | None = None,
 ) -> Localization:
     """The centre in the reference pose by one of the paper's methods.
@@ -75,14 +82,19 @@ def localize_paper(
     `base` and `bicubic` average the de-shifted circles of all frames given (the paper gives
     one). start_px: where the fiducial is in the reference pose to within 3 px; what lies
     farther off is ignored. Without it the strongest circle of the first frame is taken.
+    radius_px: (low, high), or one number; the transform searches half as far again, because
+    its phases cannot tell the ends of their range apart. Default: what ``settings`` say.
 
     Raises NoRoundObjectError, AmbiguousObjectError, ObjectAtBorderError, OutsideGateError,
-    InconsistentFramesError, and the errors of bad frames and shifts.
+    SaturatedError, InconsistentFramesError, and the errors of bad frames and shifts.
     """
     if method not in get_args(PaperMethod):
         raise ParameterError(f"method is {method!r}; base, bicubic or sr is needed")
     settings = settings or PaperSettings()
     check_factor(settings.factor)
+    if (radii := checked_radii(radius_px)) is not None:
+        wider = (max(1.0, radii[0] / SEARCHED_BEYOND), radii[1] * SEARCHED_BEYOND)
+        settings = replace(settings, hough=replace(settings.hough, radius_px=wider))
     stack, shifts = check_frames_and_shifts(frames, shifts_px)
     start = _checked_start(start_px, gate_px)
     if start is None:
@@ -100,6 +112,9 @@ def localize_paper(
         centre = centres.mean(axis=0)
         radius = float(np.mean([circle.radius_px for circle in circles]))
     _refuse_outside(centre, radius, start, gate_px, (stack.shape[1], stack.shape[2]))
+    for frame, shift in zip(stack, shifts, strict=True):
+        disc = frame[_region(frame.shape, centre + shift, settings.hough).slices]
+        refuse_saturated(disc, radius, saturation_level)
     residuals = centres - centre
     _refuse_inconsistent(residuals)
     return _localization(stack, shifts, method, centre, radius, residuals)
@@ -241,7 +256,7 @@ def _refuse_inconsistent(residuals: Array) -> None:
 def _localization(
     stack: Array,
     shifts: Array,
-    method: PaperMethod,
+    method: str,
     centre: Array,
     radius: float,
     residuals: Array,
@@ -251,6 +266,11 @@ def _localization(
     single = sigma_px("base" if method == "base" else "bicubic")
     inside, outside = _levels(stack[0], centre + shifts[0], radius)
     sigma = estimate_noise_sigma(stack)
+    if not abs(inside - outside) >= MIN_CONTRAST * sigma:
+        raise NoRoundObjectError(
+            f"the circle at row {centre[0]:.1f}, col {centre[1]:.1f} does not stand out from the "
+            f"noise (contrast {abs(inside - outside):.3g}, noise {sigma:.3g})"
+        )
     return Localization(
         centre_px=centre,
         covariance_px2=np.eye(2) * sigma_px(method) ** 2 / used,

@@ -17,6 +17,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
+from case_record.presence import Presence
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
 from dicom_listener.pixels import magnitude_pixels
@@ -64,10 +65,12 @@ class Frames:
 
 def serve(config: Config, should_stop: Callable[[], bool]) -> None:
     """Work until `should_stop`; looks for requests every `poll_s`, says every second: alive."""
-    alive = config.room.case_dir / ALIVE
+    case_dir = config.room.case_dir
+    alive = case_dir / ALIVE
     said_s = 0.0
-    with CaseRecord(config.room.case_dir, create=True) as record:
+    with CaseRecord(case_dir, create=True) as record, Presence(case_dir, "worker") as presence:
         while not should_stop():
+            presence.beat()
             if time.monotonic() - said_s > 1.0:
                 alive.touch()
                 said_s = time.monotonic()
@@ -161,10 +164,14 @@ def describe_result(frames: Frames, found: Localization) -> dict[str, Any]:
             "col_direction": list(geometry.col_direction),
             "spacing_mm": list(geometry.spacing_mm),
         },
-        "scan_s": float(
-            sum((s.acquired_to_s or 0.0) - (s.acquired_from_s or 0.0) for s in frames.slices)
-        ),
+        "scan_s": sum(_scan_s(row.header) for row in frames.slices),
     }
+
+
+def _scan_s(header: Mapping[str, Any]) -> float:
+    """How long the scanner took for this slice, by its own clock; 0 where it does not say."""
+    interval = header.get("interval")
+    return float(interval["end_s"] - interval["start_s"]) if interval else 0.0
 
 
 def _code_of(error: EngineError | UnusableSlicesError | UnusableError) -> str:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -33,7 +34,7 @@ def numerical(
     map_trials: Annotated[int, typer.Option(help="A cell of the map; 0 leaves it out.")] = 10,
     radius: Annotated[float, typer.Option(help="Of the circle, px of the base frame.")] = 4.0,
     snr: Annotated[float, typer.Option(help="Amplitude over noise per channel.")] = 20.0,
-    blur: Annotated[float, typer.Option(help="Sigma of the Gaussian blur, px.")] = 0.3,
+    blur: Annotated[float, typer.Option(help="Sigma of the Gaussian blur, px.")] = 0.2,
     sensitivity: Annotated[float, typer.Option(help="Of the circle finding, 0 to 1.")] = 0.85,
     shift_set: Annotated[
         str, typer.Option(help="paper (random), quarter, half or lattice5.")
@@ -148,6 +149,9 @@ def _run_numerical(
     as_json: bool,
     scheduler: str | None,
 ) -> None:
+    # The matrices are small: threads would only wait for each other. Before numpy is loaded.
+    for library in ("OMP", "OPENBLAS", "MKL"):
+        os.environ.setdefault(f"{library}_NUM_THREADS", "1")
     # Loaded here, so that the command's help costs nothing.
     from rich.console import Console
 

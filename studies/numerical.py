@@ -45,7 +45,7 @@ class StudyPoint:
     scene: str = "drawn"
     radius_px: float = 4.0
     snr: float = 20.0
-    blur_sigma_px: float = 0.3
+    blur_sigma_px: float = 0.2
     sensitivity: float = 0.85
     shift_set: str = "paper"
     seed: int = 1
@@ -145,13 +145,24 @@ def _shifts(point: StudyPoint, rng: np.random.Generator) -> Array:
 
 
 def _frame(point: StudyPoint, centre: Array, rng: np.random.Generator) -> Array:
-    """Magnitude of the scene with noise in both channels; a filter colours the noise, too."""
+    """Magnitude of the scene with noise in both channels.
+
+    SNR is that of the scan: a filter weakens and colours the noise of the image, but it is the
+    same scan, and the bound stays the same.
+    """
     clean, sigma = scene_frame(point, centre), 1.0 / point.snr
     if point.scene == "hamming":
+        sigma *= filtered_share(point.psf)
         channels = [filtered_noise(clean.shape, sigma, point.psf, rng) for _ in range(2)]
     else:
         channels = [rng.normal(0.0, sigma, clean.shape) for _ in range(2)]
     return np.hypot(clean + channels[0], channels[1])
+
+
+def filtered_share(psf: Psf) -> float:
+    """Standard deviation of white noise that a k-space filter lets pass."""
+    row, col = (np.fft.fftfreq(size) for size in SCANNER_SHAPE)
+    return float(np.sqrt(np.mean(psf.window(row[:, None], col[None, :]) ** 2)))
 
 
 Localizer = Callable[[StudyPoint, Array, Array, Array], Localization]

@@ -80,7 +80,10 @@ def _error_cloud(axes: Axes, study: NumericalStudy, method: str, limit: float) -
     axes.axhline(0, color="0.7", linewidth=0.8, zorder=0)
     axes.axvline(0, color="0.7", linewidth=0.8, zorder=0)
     mean = study.summaries[method].mean_error_px
-    axes.text(0.03, 0.96, f"mean {mean:.4f} px", transform=axes.transAxes, va="top", fontsize=10)
+    box = {"facecolor": "white", "edgecolor": "0.8", "alpha": 0.9}
+    axes.text(
+        0.04, 0.95, f"mean {mean:.4f} px", transform=axes.transAxes, va="top", fontsize=10, bbox=box
+    )
     axes.grid(alpha=0.25)
 
 

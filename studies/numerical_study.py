@@ -54,7 +54,7 @@ def chosen_parameters(point: StudyPoint) -> dict[str, str]:
         "circle radius": f"{point.radius_px:g} px of the base frame",
         "blur": f"Gaussian, sigma {point.blur_sigma_px:g} px, before the scaling",
         "scaling": "5000 to 125 px, mean over 40 x 40 pixels",
-        "noise": f"magnitude of two noisy channels (Rician), SNR {point.snr:g}",
+        "noise": f"magnitude of two noisy channels (Rician), SNR {point.snr:g} before any filter",
         "place": "row phase drawn anew each trial; column one high-resolution pixel on",
         "circle finding": f"radii {low:g} to {high:g} px, sensitivity {point.sensitivity:g}, "
         "edge threshold by Otsu, within 3 px of a start known to 1 px",

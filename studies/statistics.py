@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
@@ -85,9 +85,11 @@ def f_test(trials: list[Trial], first: str, second: str) -> FTest | None:
 def bound_mean_error_px(point: StudyPoint, frames: int) -> float:
     """Cramér-Rao bound of the mean distance, magnitude data, over nine places between pixels.
 
-    Unknown: centre, radius, amplitude, background. Noise is taken as white; where a filter
-    colours it, the number is that of the same frame with white noise of the same strength.
+    Unknown: centre, radius, amplitude, background. A k-space filter takes no information away,
+    so the bound of a filtered scene is that of the scan before the filter.
     """
+    if point.scene == "hamming":
+        point = replace(point, scene="flat")
     variance = np.mean([_variance(point, row, col) for row in _PHASES for col in _PHASES])
     return math.sqrt(math.pi / 2 * float(variance) / frames)
 
@@ -105,8 +107,7 @@ def _variance(point: StudyPoint, row_phase: float, col_phase: float) -> float:
         change = scene_frame(point, centre + ahead) - scene_frame(point, centre - ahead)
         derivatives.append(change / (2 * step))
     wider, narrower = (
-        scene_frame(StudyPoint(**{**vars(point), "radius_px": point.radius_px + d}), centre)
-        for d in (step, -step)
+        scene_frame(replace(point, radius_px=point.radius_px + d), centre) for d in (step, -step)
     )
     derivatives.append((wider - narrower) / (2 * step))
     jacobian = np.stack([d.ravel() for d in derivatives], axis=1)

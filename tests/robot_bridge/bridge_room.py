@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -58,16 +58,23 @@ class EmulatedControllers:
             for address, stage in enumerate(self.stages.values(), start=1)
         ]
         self.all = controllers
-        bus = EmulatedBus(controllers, switches, random.Random(0))
-        self._server = EmulatorServer(bus, PseudoTerminal())
+        self.bus = EmulatedBus(controllers, switches, random.Random(0))
+        self._server = EmulatorServer(self.bus, PseudoTerminal())
         self.url = self._server.wire.url
         self._running = True
+        self.last_moving_s = 0.0
         self._thread = threading.Thread(target=self._serve, name="controllers", daemon=True)
         self._thread.start()
 
     def _serve(self) -> None:
         while self._running:
             self._server.serve_once()
+            if self.moving:
+                self.last_moving_s = time.monotonic()
+
+    def power_cycle(self) -> None:
+        for controller in self.all:
+            controller.power_on(time.monotonic(), deaf_s=0.2)
 
     @property
     def moving(self) -> bool:
@@ -92,8 +99,10 @@ class BridgeRoom:
     clients: list[BridgeClient] = field(default_factory=list)
     outcomes: list[object] = field(default_factory=list)
 
-    def start_daemon(self, *arguments: str) -> subprocess.Popen[str]:
-        command = [sys.executable, "-m", "robot_bridge", "--config", str(self.config_file)]
+    def start_daemon(
+        self, *arguments: str, python: Sequence[str] = (sys.executable, "-m", "robot_bridge")
+    ) -> subprocess.Popen[str]:
+        command = [*python, "--config", str(self.config_file)]
         log = (self.folder / f"daemon-{len(self.daemons)}.log").open("w")
         with log:
             daemon = subprocess.Popen(

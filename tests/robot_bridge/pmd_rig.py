@@ -51,9 +51,11 @@ class Rig:
     def serve(self) -> None:
         while self.running:
             wait_s = min(self.server.wait_s(time.monotonic()), 0.02)
-            ready, _, _ = select.select(self.server.wire.descriptors(), [], [], wait_s)
+            with contextlib.suppress(OSError):  # closed under our feet
+                ready, _, _ = select.select(self.server.wire.descriptors(), [], [], wait_s)
             with self.lock:
-                self.server.serve(ready)
+                if self.running:
+                    self.server.serve(ready)
 
 
 @contextlib.contextmanager
@@ -90,7 +92,8 @@ def rig(
     finally:
         made.running = False
         thread.join(2.0)
-        made.server.close()
+        with contextlib.suppress(OSError):  # a test may have closed it
+            made.server.close()
 
 
 def axis_config(name: str, url: str, address: int, drive: str = "open_loop", **changes: object):
@@ -117,10 +120,14 @@ def axis_config(name: str, url: str, address: int, drive: str = "open_loop", **c
 
 @contextlib.contextmanager
 def opened(made: Rig, drive: str = "open_loop", declare: bool = True, **changes: object):
-    """A driver for axes xt (address 1) and yt (address 2), opened, standing at zero."""
+    """A driver for axes xt (address 1) and yt (address 2), opened, standing at zero.
+
+    drive "mixed": xt in open loop, yt in closed loop.
+    """
     options = {k: changes.pop(k) for k in ("park_after_move", "capture_file") if k in changes}
+    drives = ("open_loop", "closed_loop") if drive == "mixed" else (drive, drive)
     axes = [
-        axis_config(name, made.url, address, drive, **changes)
+        axis_config(name, made.url, address, drives[address - 1], **changes)
         for name, address in (("xt", 1), ("yt", 2))
     ]
     motors = PmdMotors(axes, **options)

@@ -86,6 +86,20 @@ def test_a_stop_from_outside_ends_the_move_as_stopped_and_latches(room: VirtualR
     assert client.status.phase is WorkPhase.START_UP
 
 
+def test_a_latched_stop_survives_a_restart_of_the_bridge(room: VirtualRoom):
+    client = ready(room)
+    client.request_stop(emergency=True)
+    client.pump(0.1)
+    room.crash_bridge()
+    client.open()
+    assert client.status.stopped
+    assert client.status.phase is WorkPhase.EMERGENCY
+    with pytest.raises(RefusedError, match="stop_latched"):
+        client.arm("test")
+    client.rearm("test")
+    assert client.status.armed
+
+
 def test_silence_of_the_bridge_is_a_lost_link_and_open_begins_anew(room: VirtualRoom):
     client = ready(room)
     room.unplug()

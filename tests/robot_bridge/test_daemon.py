@@ -79,7 +79,7 @@ def test_emergency_also_parks_the_drives(tmp_path: Path):
         client.pump(2.0)
         assert client.status.phase is WorkPhase.EMERGENCY
         assert client.status.parked
-        assert all(controller.status().parked for controller in room.controllers.all)
+        assert all(controller.parked for controller in room.controllers.all)
 
 
 SERVICE = """

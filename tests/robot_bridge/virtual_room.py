@@ -4,6 +4,7 @@ The client, both ends of the protocol, the bridge and the journal are the progra
 clock, the wire and the motors are models. Everything follows from one seed.
 """
 
+import json
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -14,7 +15,7 @@ from axis_model import AXES, ModelMotors, Stage
 from robot_bridge.bridge import Bridge, BridgeSettings
 from robot_bridge.client import BridgeClient
 from robot_bridge.framing import Deframer, FrameCounters, StopFrame
-from robot_bridge.journal import CommandRecord, Journal
+from robot_bridge.journal import FILE_NAME, CommandRecord, Journal
 from robot_bridge.messages import AxisTravel
 from simulator.serial_line import FaultyDirection, LineFaults
 
@@ -34,6 +35,14 @@ class Clock:
         return self.now_s
 
 
+@dataclass(frozen=True)
+class DeliveredStop:
+    """A STOP frame that reached the bridge's end of the wire undamaged."""
+
+    at_s: float
+    nonce: int
+
+
 class VirtualRoom:
     def __init__(self, folder: Path, seed: int, *, deadman_s: float = 1.0) -> None:
         self.rng = random.Random(seed)
@@ -42,7 +51,7 @@ class VirtualRoom:
         self.motors = ModelMotors(self.stage)
         self.to_bridge = FaultyDirection(LineFaults(), random.Random(f"{seed}:to bridge"))
         self.to_service = FaultyDirection(LineFaults(), random.Random(f"{seed}:to service"))
-        self.stops_delivered_s: list[float] = []
+        self.stops_delivered: list[DeliveredStop] = []
         self.bridge: Bridge | None = None
         self.bridge_back_s = 0.0
         self.restarts = 0
@@ -88,6 +97,12 @@ class VirtualRoom:
         assert self._journal is not None
         return self._journal.commands
 
+    def rearmed_s(self) -> list[float]:
+        """When re-armings were carried out, read from the journal's file."""
+        lines = (self._folder / FILE_NAME).read_text().splitlines()
+        entries = (json.loads(line[9:]) for line in lines if '"kind":"rearm"' in line)
+        return [entry["t"] for entry in entries]
+
     # --- time ---------------------------------------------------------------------------------
 
     def step(self) -> None:
@@ -97,8 +112,9 @@ class VirtualRoom:
             if self.clock() >= self.bridge_back_s:
                 self.start_bridge()
             return
-        if any(isinstance(frame, StopFrame) for frame in self._spy.feed(data)):
-            self.stops_delivered_s.append(self.clock())
+        for frame in self._spy.feed(data):
+            if isinstance(frame, StopFrame):
+                self.stops_delivered.append(DeliveredStop(self.clock(), frame.nonce))
         try:
             if data:
                 self.bridge.receive(data)
@@ -121,6 +137,7 @@ class VirtualRoom:
             open_transport=lambda: VirtualTransport(self),
             clock=self.clock,
             pause=self.run,
+            random_bits=self.rng.getrandbits,
             stop_thread=False,
             **settings,  # type: ignore[arg-type]
         )

@@ -1,56 +1,18 @@
-"""A virtual scanner's neighbours on loopback, for real: motor truth, service, DICOM receiver."""
+"""Fixtures: the neighbours of a virtual scanner, and the scanner itself in a thread."""
 
 import json
 import socketserver
 import threading
-import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
 import pytest
-from pydicom.dataset import Dataset
-from pynetdicom import AE, StoragePresentationContexts, evt
+from neighbours import Page, Receiver, Running, Stages, Start
 
-
-@dataclass
-class Stages:
-    """Stage positions over time; `go` moves on a straight line in `duration_s`."""
-
-    port: int = 0
-    times_s: list[float] = field(default_factory=lambda: [0.0])
-    positions_mm: list[dict[str, float]] = field(default_factory=lambda: [{"xt": 0.0, "yt": 0.0}])
-
-    def stand(self, **positions_mm: float) -> None:
-        self.times_s[:], self.positions_mm[:] = [0.0], [positions_mm]
-
-    def go(self, duration_s: float, **positions_mm: float) -> None:
-        now = time.time()
-        start = self.at(now)
-        self.times_s[:] = [now, now + duration_s]
-        self.positions_mm[:] = [start, positions_mm]
-
-    def at(self, time_s: float) -> dict[str, float]:
-        first, last = self.times_s[0], self.times_s[-1]
-        share = 0.0 if last == first else min(max((time_s - first) / (last - first), 0.0), 1.0)
-        start, end = self.positions_mm[0], self.positions_mm[-1]
-        return {axis: start[axis] + share * (end[axis] - start[axis]) for axis in start}
-
-    def answer(self, question: str) -> dict[str, Any]:
-        match question.split():
-            case ["where"]:
-                now = time.time()
-                moving = self.times_s[0] <= now < self.times_s[-1]
-                return {"t": now, "positions_mm": self.at(now), "moving": moving}
-            case ["history", first, last]:
-                begin = max(float(first), self.times_s[0])
-                end = min(float(last), self.times_s[-1])
-                count = max(round((end - begin) / 0.002), 0)
-                times = [begin + (end - begin) * (n + 1) / count for n in range(count)]
-                samples = [[t, self.at(t)] for t in times]
-                return {"start_mm": self.at(float(first)), "samples": samples}
-        return {"error": f"not understood: {question}"}
+from simulator.config import parse_virtual_room
+from simulator.scan_operator import operate
 
 
 @pytest.fixture
@@ -67,19 +29,6 @@ def stages() -> Iterator[Stages]:
         server.daemon_threads = True
         truth.port = server.server_address[1]
         yield from _serving(server, truth)
-
-
-@dataclass
-class Page:
-    """What the service's state says; a test sets `state`."""
-
-    url: str = ""
-    state: dict[str, Any] = field(default_factory=lambda: {"acquisition_request": None})
-    status: int = 200
-
-    def ask_for(self, request_id: str, hold_id: int = 1, count: int = 1, **more: Any) -> None:
-        request = {"request_id": request_id, "hold_id": hold_id, "count": count, **more}
-        self.state = {"acquisition_request": {"slice_position_mm": None, **request}}
 
 
 @pytest.fixture
@@ -114,41 +63,6 @@ def _serving(server: socketserver.BaseServer, value: Any) -> Iterator[Any]:
         thread.join()
 
 
-@dataclass
-class Receiver:
-    """A C-STORE SCP; `statuses` are given first, then 0x0000."""
-
-    port: int = 0
-    arrived: list[Dataset] = field(default_factory=list)
-    arrived_at_s: list[float] = field(default_factory=list)
-    statuses: list[int] = field(default_factory=list)
-
-    def wait_for(self, count: int, timeout_s: float = 15.0) -> list[Dataset]:
-        deadline_s = time.monotonic() + timeout_s
-        while len(self.arrived) < count:
-            assert time.monotonic() < deadline_s, f"{len(self.arrived)} of {count} slices arrived"
-            time.sleep(0.01)
-        return self.arrived
-
-    def start(self, port: int = 0) -> Any:
-        entity = AE(ae_title="AUTOSPINE")
-        entity.supported_contexts = StoragePresentationContexts
-        server = entity.start_server(
-            ("127.0.0.1", port), block=False, evt_handlers=[(evt.EVT_C_STORE, self._store)]
-        )
-        self.port = server.server_address[1]
-        return server
-
-    def _store(self, event: evt.Event) -> int:
-        if self.statuses:
-            return self.statuses.pop(0)
-        dataset = event.dataset
-        dataset.file_meta = event.file_meta
-        self.arrived.append(dataset)
-        self.arrived_at_s.append(time.monotonic())
-        return 0x0000
-
-
 @pytest.fixture(scope="session")
 def _receiver() -> Iterator[Receiver]:
     receiver = Receiver()
@@ -163,3 +77,32 @@ def receiver(_receiver: Receiver) -> Receiver:
     for kept in (_receiver.arrived, _receiver.arrived_at_s, _receiver.statuses):
         kept.clear()
     return _receiver
+
+
+@pytest.fixture
+def start(tmp_path: Path, stages: Stages, page: Page, receiver: Receiver) -> Iterator[Start]:
+    stop, threads = threading.Event(), []
+
+    def start(scanner: dict[str, Any] | None = None, **room: Any) -> Running:
+        table = {
+            "service_url": page.url,
+            "listener_port": receiver.port,
+            "motors_truth_port": stages.port,
+            "truth_file": str(tmp_path / "truth.jsonl"),
+            "acquisition_s": 0.05,
+            "reconstruction_s": 0.03,
+            "poll_s": 0.01,
+            "retry_s": 0.1,
+            **(scanner or {}),
+        }
+        running = Running(parse_virtual_room({**room, "scanner": table}))
+        thread = threading.Thread(target=operate, args=(running.room, stop, running.notes.append))
+        thread.start()
+        threads.append(thread)
+        return running
+
+    yield start
+    stop.set()
+    for thread in threads:
+        thread.join(timeout=15)
+        assert not thread.is_alive(), "the scanner stops when it is told to"

@@ -13,10 +13,10 @@ from typing import Any
 import numpy as np
 import pytest
 import serial
-from conftest import Page, Receiver
+from neighbours import Page, Receiver
 
 from simulator.config import parse_virtual_room
-from simulator.scanner import operate
+from simulator.scan_operator import operate
 from simulator.scene import true_fiducial_mm
 from simulator.truth_client import TruthAddress, TruthError, ask_path, ask_where
 

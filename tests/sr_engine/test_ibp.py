@@ -106,7 +106,7 @@ def test_a_scene_that_its_frames_determine_is_found_again() -> None:
     frames = np.stack([_seen(scene, row, col, Blur()) for row, col in shifts])
     done = reconstruct_ibp(frames, shifts, blur=Blur(), stopping=Stopping(400, 0.0))
     assert done.residual_history[-1] < 1e-5 * done.residual_history[0]
-    assert np.abs(done.image - scene)[4:-4, 4:-4].max() < 1e-3
+    assert np.abs(done.image - scene)[4:-4, 4:-4].max() < 2e-3
 
 
 def test_the_noise_is_estimated_from_the_frames_beside_a_bright_object() -> None:

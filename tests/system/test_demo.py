@@ -8,6 +8,7 @@ import urllib.request
 import pytest
 
 from case_record.record import CaseRecord
+from simulator.demo_room import known_faults
 
 PROCESSES = {
     "service": "command_line service",
@@ -61,7 +62,14 @@ def test_the_page_stays_up_until_ctrl_c_and_then_all_ends(demo):
         assert probe.connect_ex(("127.0.0.1", port)) != 0
 
 
-@pytest.mark.parametrize("victim", PROCESSES)
+@pytest.mark.parametrize(
+    "victim",
+    [
+        # the ones that hold the robot by default, every one in the long campaign
+        pytest.param(name, marks=() if name in ("bridge", "service") else pytest.mark.soak)
+        for name in PROCESSES
+    ],
+)
 def test_a_killed_process_ends_in_a_stopped_robot_and_the_case_goes_on(demo, victim):
     running = demo("--exit", "--punctures", "1", "--seed", "5")
     running.wait_for_event("move_sent")
@@ -105,3 +113,23 @@ def test_an_unknown_fault_is_named_with_those_that_exist(demo):
     assert ended.code == 2
     assert "earthquake" in ended.err
     assert "late" in ended.err
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("seed", range(10))
+def test_three_punctures_for_ten_seeds(demo, seed):
+    running = demo("--exit", "--punctures", "3", "--seed", str(seed))
+    ended = running.ended(120.0)
+    assert ended.code == 0, ended.err
+    assert_good(ended.results(), 3)
+
+
+@pytest.mark.soak
+@pytest.mark.parametrize("fault", known_faults())
+def test_a_fault_of_the_scanner_costs_slices_but_no_accuracy(demo, fault):
+    running = demo("--exit", "--punctures", "1", "--seed", "2", "--fault", fault)
+    ended = running.ended(170.0)
+    assert ended.code in (0, 3), ended.err
+    if ended.code == 0:
+        assert_good(ended.results(), 1)
+    assert "Traceback" not in ended.err

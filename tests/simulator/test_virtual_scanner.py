@@ -1,10 +1,11 @@
 """The virtual scanner between a real HTTP server, a real C-STORE receiver and a truth server."""
 
-import json
+import shutil
 import socket
+import subprocess
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from datetime import datetime
 from pathlib import Path
@@ -12,67 +13,14 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import Page, Receiver, Stages
+from neighbours import Page, Receiver, Stages, Start
+from pydicom import dcmread
 
-from simulator.config import VirtualRoom, VirtualRoomError, parse_virtual_room
+from simulator.config import VirtualRoom, VirtualRoomError
 from simulator.mr_slice import acquire
-from simulator.scanner import operate
+from simulator.scan_operator import operate
 from simulator.scene import true_fiducial_mm
 from sr_engine.geometry import SliceGeometry
-
-Start = Callable[..., Any]
-
-
-class Running:
-    """A scanner in a thread; what it said, and its truth file."""
-
-    def __init__(self, room: VirtualRoom) -> None:
-        assert room.scanner is not None
-        self.room = room
-        self.notes: list[str] = []
-        self.truth_file = Path(room.scanner.truth_file)
-
-    def truth(self, kind: str = "acquisition") -> list[dict[str, Any]]:
-        if not self.truth_file.exists():
-            return []
-        lines = [json.loads(line) for line in self.truth_file.read_text().splitlines()]
-        return [line for line in lines if line["kind"] == kind]
-
-    def wait_for_truth(self, count: int, kind: str = "acquisition") -> list[dict[str, Any]]:
-        deadline_s = time.monotonic() + 15
-        while len(self.truth(kind)) < count:
-            assert time.monotonic() < deadline_s, f"{self.truth(kind)}, {self.notes}"
-            time.sleep(0.01)
-        return self.truth(kind)
-
-
-@pytest.fixture
-def start(tmp_path: Path, stages: Stages, page: Page, receiver: Receiver) -> Iterator[Start]:
-    stop, threads = threading.Event(), []
-
-    def start(scanner: dict[str, Any] | None = None, **room: Any) -> Running:
-        table = {
-            "service_url": page.url,
-            "listener_port": receiver.port,
-            "motors_truth_port": stages.port,
-            "truth_file": str(tmp_path / "truth.jsonl"),
-            "acquisition_s": 0.05,
-            "reconstruction_s": 0.03,
-            "poll_s": 0.01,
-            "retry_s": 0.1,
-            **(scanner or {}),
-        }
-        running = Running(parse_virtual_room({**room, "scanner": table}))
-        thread = threading.Thread(target=operate, args=(running.room, stop, running.notes.append))
-        thread.start()
-        threads.append(thread)
-        return running
-
-    yield start
-    stop.set()
-    for thread in threads:
-        thread.join(timeout=15)
-        assert not thread.is_alive(), "the scanner stops when it is told to"
 
 
 def geometry_of(dataset: Any) -> SliceGeometry:
@@ -189,6 +137,30 @@ def test_a_slice_taken_while_the_stages_move_is_marked_so_in_the_truth_and_is_sm
     )
     assert still < 60, "noise of both slices: 33 times the root of two"
     assert moving > 2 * still
+
+
+@pytest.mark.parametrize("sop_class", ["classic", "enhanced"])
+def test_dcmtks_storescp_takes_the_slices(
+    start: Start, page: Page, tmp_path: Path, sop_class: str
+) -> None:
+    if shutil.which("storescp") is None:
+        pytest.skip("storescp (Debian package dcmtk) is not installed")
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    folder = tmp_path / "received"
+    folder.mkdir()
+    command = ["storescp", "-aet", "AUTOSPINE", "-od", str(folder), "-fe", ".dcm", str(port)]
+    with subprocess.Popen(command) as storescp:
+        try:
+            running = start({"listener_port": port, "sop_class": sop_class})
+            page.ask_for("r1", count=3)
+            deliveries = running.wait_for_truth(3, "delivery")
+        finally:
+            storescp.terminate()
+    assert all(line["sent"] for line in deliveries)
+    received = {dcmread(path).SOPInstanceUID for path in folder.glob("*.dcm")}
+    assert received == {line["sop_instance_uid"] for line in running.truth()}
 
 
 # pynetdicom leaves the socket of a refused connection to the garbage collector

@@ -12,11 +12,19 @@ from typing import Any
 
 import pytest
 from click.testing import Result
-from conftest import Page, Receiver, Stages
+from neighbours import Page, Receiver, Stages
+from pydantic import BaseModel
 from typer.testing import CliRunner
 
 from simulator import command_line
-from simulator.config import VirtualRoomError, parse_virtual_room
+from simulator.config import (
+    Fiducial,
+    ScannerSettings,
+    StaticObject,
+    VirtualRoom,
+    VirtualRoomError,
+    parse_virtual_room,
+)
 from simulator.faults import FAULTS
 
 ROOT = Path(__file__).parents[2]
@@ -152,6 +160,14 @@ def test_every_fault_has_a_line_that_says_what_it_does() -> None:
         "motion_during_scan",
     }
     assert all(10 < len(text) < 100 and "\n" not in text for text in FAULTS.values())
+
+
+def test_every_key_of_the_virtual_room_is_described() -> None:
+    todo: list[type[BaseModel]] = [VirtualRoom, Fiducial, StaticObject, ScannerSettings]
+    todo += [type(VirtualRoom().placement), type(VirtualRoom().protocol)]
+    for model in todo:
+        for name, field in model.model_fields.items():
+            assert field.description, f"{model.__name__}.{name}"
 
 
 @pytest.mark.parametrize(

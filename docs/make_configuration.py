@@ -1,0 +1,92 @@
+"""Writes docs/configuration.md from the configuration models: `python docs/make_configuration.py`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel
+from pydantic_core import PydanticUndefined
+
+from room_config.load import Config
+from simulator.config import VirtualRoom
+
+HERE = Path(__file__).parent
+_HEAD = """# Configuration
+
+One TOML file a room ([example](../examples/room.toml)). It is strict: an unknown, misspelt or missing
+key is an error that names the file and the key. Units are in the key names.
+`autospine check-config FILE` checks a file without starting anything.
+
+An environment variable overrides a key: `AUTOSPINE_LISTENER__PORT=11112` is `port` in `[listener]`
+(for containers). Secrets are hashes or file names, never values that a log could show.
+
+This page is written by `python docs/make_configuration.py` from the models themselves.
+"""
+_BRIDGE = """
+## `[bridge]` and `[[bridge.axis]]`
+
+Read by the daemon in the scanner room (`robot_bridge/config.py`), which has few packages and checks
+the table by itself. Travel limits have no default on purpose.
+
+| key | default | meaning |
+| --- | --- | --- |
+| `link` | required | Serial device or pyserial URL of the line to the service. |
+| `link_baud` | 115200 | Speed of that line. |
+| `state_dir` | required | Folder of the journal; must survive a restart. |
+| `status_file` | `state_dir`/bridge_status.json | Health, rewritten as the bridge runs. |
+| `heartbeat_s`, `deadman_s` | 0.2, 1.0 | Silence of the service longer than the deadman stops all motion. |
+| `motion_timeout_s` | 60 | A motion that lasts longer is stopped. |
+| `motion_poll_s` | 0.02 | How often the controllers are asked during a motion. |
+| `controller_baud`, `controller_timeout_s` | 115200, 0.1 | The line to the controllers. |
+| `park_after_move` | false | Park the drives after every move (a powered drive costs SNR). |
+| `guardian` | true | A second process that stops the motors if the daemon is killed. |
+| `capture_file` | none | Every byte to and from the controllers. |
+| axis `name` | required | `xt`, `yt` (top stage), `xb`, `yb` (bottom stage). |
+| axis `controller`, `address` | required | Serial device and PMD401/PMD301 address. |
+| axis `drive` | required | `open_loop` (steps) or `closed_loop` (encoder). |
+| axis `travel_min_mm`, `travel_max_mm` | required | Both ends allowed. |
+| axis `sign` | required | 1 or -1: whether the axis grows when the controller runs forward. |
+| axis `speed_hz` | 400 | wfm-steps a second, capped by the controller's own limit. |
+| axis `step_um_forward`, `step_um_reverse` | required open loop | From `autospine robot calibrate-steps`. |
+| axis `approach_um` | 0 | Overshoot so that every position is reached from the same side. |
+| axis `tolerance_um` | 20 | Open loop: how near counts as reached. |
+| axis `counts_per_mm`, `tolerance_counts`, `encoder_type` | closed loop | The encoder; type is Y13. |
+| axis `home_mm` | none | Where the reference lies. |
+"""
+
+
+def render() -> str:
+    """Return the whole page."""
+    parts = [_HEAD]
+    for name, field in Config.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            parts.append(f"\n## `[{name}]`\n\n{_table(field.annotation)}")
+    parts.append(_BRIDGE)
+    parts.append(
+        "\n## `[virtual]`\n\nThe virtual room, for `autospine demo` and `autospine scanner`; its keys "
+        "are described where they are defined, in `simulator/config.py`. Top-level keys: "
+        + ", ".join(f"`{key}`" for key in VirtualRoom.model_fields)
+        + ".\n"
+    )
+    return "".join(parts)
+
+
+def _table(model: type[BaseModel]) -> str:
+    rows = ["| key | default | meaning |", "| --- | --- | --- |"]
+    for name, field in model.model_fields.items():
+        rows.append(f"| `{name}` | {_default(field)} | {field.description or ''} |")
+    return "\n".join(rows) + "\n"
+
+
+def _default(field: Any) -> str:
+    if field.is_required():
+        return "required"
+    value = field.default
+    if value is PydanticUndefined:
+        value = field.default_factory()
+    return "none" if value in (None, "", (), []) else f"`{value}`"
+
+
+if __name__ == "__main__":
+    (HERE / "configuration.md").write_text(render(), encoding="utf-8")

@@ -1,0 +1,138 @@
+"""Server-sent events: the state whenever it changes, each new event of the record, a beat a second.
+
+One task watches the control loop and encodes once; the viewers only pass bytes on, so that many of
+them cost little. `id:` is the record's event id; a client that comes back with Last-Event-ID gets
+every event since, and the present state.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import threading
+from collections import deque
+from collections.abc import AsyncIterator
+
+from case_record.record import CaseRecord
+from case_record.rows import Event
+from room_config.load import Config
+from service.control import ControlLoop
+
+_WATCH_S = 0.01
+_LEAST_BETWEEN_STATES_S = 0.04
+_BEAT_S = 1.0
+_KEPT_EVENTS = 1000
+_EVENTS_AT_ONCE = 500
+_BEAT = b"event: beat\ndata: {}\n\n"
+
+
+class Broadcast:
+    """`start` it in the server's event loop, `close` it at the end; each viewer gets `follow`."""
+
+    def __init__(self, config: Config, loop: ControlLoop) -> None:
+        self._case_dir = config.room.case_dir
+        self._loop = loop
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._watch, name="broadcast", daemon=True)
+        self._server: asyncio.AbstractEventLoop | None = None
+        self._state_message = b""
+        self._events: deque[tuple[int, bytes]] = deque(maxlen=_KEPT_EVENTS)
+        self._newest_id = 0
+        self._turn = asyncio.Event()
+        self.viewers = 0
+
+    def start(self) -> None:
+        self._server = asyncio.get_running_loop()
+        self._thread.start()
+
+    def close(self) -> None:
+        self._closing.set()
+        self._thread.join(timeout=5.0)
+
+    # In the broadcast's own thread
+
+    def _watch(self) -> None:
+        revision = -1
+        record: CaseRecord | None = None
+        while not self._closing.wait(_WATCH_S):
+            state = self._loop.state
+            if state.revision == revision or not state.case_uid:
+                continue
+            revision = state.revision
+            if record is None:
+                record = CaseRecord(self._case_dir)
+                self._newest_id = max(0, record.last_event_id() - _KEPT_EVENTS)
+            events = record.events(self._newest_id) if state.event_id > self._newest_id else []
+            messages = [(event.event_id, _event_message(event)) for event in events]
+            if events:
+                self._newest_id = events[-1].event_id
+            self._tell(_state_message(state.model_dump_json()), messages)
+            self._closing.wait(_LEAST_BETWEEN_STATES_S)
+        if record is not None:
+            record.close()
+
+    def _tell(self, state_message: bytes, messages: list[tuple[int, bytes]]) -> None:
+        assert self._server is not None
+        with contextlib.suppress(RuntimeError):  # the server's loop has ended
+            self._server.call_soon_threadsafe(self._publish, state_message, messages)
+
+    # In the server's event loop
+
+    def _publish(self, state_message: bytes, messages: list[tuple[int, bytes]]) -> None:
+        self._state_message = state_message
+        self._events.extend(messages)
+        turn, self._turn = self._turn, asyncio.Event()
+        turn.set()
+
+    async def follow(self, after_id: int) -> AsyncIterator[bytes]:
+        """Yield messages for one viewer: what it missed since an event id, and what comes."""
+        self.viewers += 1
+        try:
+            text, after_id = await asyncio.to_thread(self._missed, after_id)
+            yield b"retry: 500\n\n" + text + _state_message(self._loop.state.model_dump_json())
+            shown = self._state_message
+            while True:
+                turn = self._turn
+                text, after_id = self._kept_since(after_id)
+                if shown is not self._state_message:
+                    shown = self._state_message
+                    text += shown
+                if text:
+                    yield text
+                try:
+                    await asyncio.wait_for(turn.wait(), _BEAT_S)
+                except TimeoutError:
+                    yield _BEAT
+        finally:
+            self.viewers -= 1
+
+    def _kept_since(self, after_id: int) -> tuple[bytes, int]:
+        if not self._events or self._events[-1][0] <= after_id:
+            return b"", after_id
+        new: list[bytes] = []
+        for event_id, message in reversed(self._events):
+            if event_id <= after_id:
+                break
+            new.append(message)
+        return b"".join(reversed(new)), self._events[-1][0]
+
+    def _missed(self, after_id: int) -> tuple[bytes, int]:
+        """Everything in the record after an event id, for a viewer that comes (back)."""
+        if not self._loop.state.case_uid:
+            return b"", after_id
+        text: list[bytes] = []
+        with CaseRecord(self._case_dir) as record:
+            while events := record.events(after_id, _EVENTS_AT_ONCE):
+                text += map(_event_message, events)
+                after_id = events[-1].event_id
+        return b"".join(text), after_id
+
+
+def _state_message(text: str) -> bytes:
+    return f"event: state\ndata: {text}\n\n".encode()
+
+
+def _event_message(event: Event) -> bytes:
+    body = {k: getattr(event, k) for k in ("event_id", "wall_s", "source", "who", "kind", "body")}
+    return f"id: {event.event_id}\nevent: record\ndata: {json.dumps(body)}\n\n".encode()

@@ -1,0 +1,66 @@
+// Requests to the service. What is refused is a Refusal whose text says what to do.
+
+export class Refusal extends Error {
+  constructor(status, problem) {
+    super(problem.detail || problem.title || `the service answered ${status}`);
+    this.status = status;
+    this.code = problem.title ?? "";
+  }
+}
+
+let csrf = "";
+export const useCsrf = (token) => { csrf = token ?? ""; };
+
+async function request(method, path, body, headers = {}) {
+  let answer;
+  try {
+    answer = await fetch(path, {
+      method,
+      cache: method === "GET" ? "default" : "no-store",
+      credentials: "same-origin",
+      headers: {
+        ...(body === undefined ? {} : { "Content-Type": "application/json" }),
+        ...(csrf && method !== "GET" ? { "X-CSRF-Token": csrf } : {}),
+        ...headers,
+      },
+      body: body === undefined ? undefined : JSON.stringify(body),
+    });
+  } catch {
+    throw new Refusal(0, { detail: "The service does not answer." });
+  }
+  if (answer.ok) return answer;
+  let problem = {};
+  try {
+    problem = await answer.json();
+  } catch {
+    // not a problem document: the status has to do
+  }
+  throw new Refusal(answer.status, problem);
+}
+
+// crypto.randomUUID exists on HTTPS only; this page must also work on plain HTTP.
+function onceKey() {
+  const bytes = crypto.getRandomValues(new Uint8Array(16));
+  return Array.from(bytes, (byte) => byte.toString(16).padStart(2, "0")).join("");
+}
+
+export async function get(path) {
+  return (await request("GET", path)).json();
+}
+
+export async function getPixels(path) {
+  const answer = await request("GET", path);
+  const values = new Float32Array(await answer.arrayBuffer());
+  const [rows, cols] = answer.headers.get("X-Shape").split(",").map(Number);
+  return { values, rows, cols };
+}
+
+// A command that is sent twice (a lost answer, a double click) is carried out once.
+export async function order(method, path, body = {}) {
+  const answer = await request(method, path, body, { "Idempotency-Key": onceKey() });
+  return answer.status === 204 || answer.status === 202 ? null : answer.json();
+}
+
+export async function stopRobot(emergency = false) {
+  await request("POST", "/api/v1/stop", { emergency });
+}

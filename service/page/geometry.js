@@ -1,0 +1,55 @@
+// Where pixels are in the patient (LPS mm), the same convention as sr_engine/geometry.py:
+// pixel (0, 0) has its centre at (0, 0); row_direction is where the row index grows.
+
+export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+
+export function patientFromPixel(geometry, [row, col]) {
+  const [betweenRows, betweenCols] = geometry.spacing_mm;
+  return geometry.position_mm.map(
+    (value, k) =>
+      value + row * betweenRows * geometry.row_direction[k] + col * betweenCols * geometry.col_direction[k],
+  );
+}
+
+export function pixelFromPatient(geometry, pointMm) {
+  const from = pointMm.map((value, k) => value - geometry.position_mm[k]);
+  return [
+    dot(from, geometry.row_direction) / geometry.spacing_mm[0],
+    dot(from, geometry.col_direction) / geometry.spacing_mm[1],
+  ];
+}
+
+const LETTERS = [["L", "R"], ["P", "A"], ["H", "F"]];
+const WORDS = [["left", "right"], ["back", "front"], ["head", "feet"]];
+
+function pick(names, direction) {
+  let axis = 0;
+  for (const k of [1, 2]) if (Math.abs(direction[k]) > Math.abs(direction[axis])) axis = k;
+  return names[axis][direction[axis] >= 0 ? 0 : 1];
+}
+
+// The patient's side towards which a direction points.
+export const letter = (direction) => pick(LETTERS, direction);
+export const side = (direction) => pick(WORDS, direction);
+
+export const opposite = (direction) => direction.map((value) => -value);
+
+// (row, col) mm in the slice -> "0.21 mm to head, 0.05 mm to left"
+export function inWords(geometry, rowMm, colMm, digits = 2) {
+  const part = (value, direction) => {
+    const towards = value >= 0 ? direction : opposite(direction);
+    return `${Math.abs(value).toFixed(digits)} mm to ${side(towards)}`;
+  };
+  return `${part(rowMm, geometry.row_direction)}, ${part(colMm, geometry.col_direction)}`;
+}
+
+// Half-axes (mm) and direction (degrees, from growing columns to growing rows) of a covariance.
+export function ellipse([[rr, rc], [, cc]], sigmas) {
+  const middle = (rr + cc) / 2;
+  const spread = Math.hypot((cc - rr) / 2, rc);
+  return {
+    long: sigmas * Math.sqrt(Math.max(middle + spread, 0)),
+    short: sigmas * Math.sqrt(Math.max(middle - spread, 0)),
+    turnDeg: (0.5 * Math.atan2(2 * rc, cc - rr) * 180) / Math.PI,
+  };
+}

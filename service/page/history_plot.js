@@ -1,0 +1,38 @@
+// Error of each measurement to the target that was set then, ± 1 σ, on a logarithmic scale: the
+// interesting errors go from 20 mm down to 0.02 mm.
+
+import { byId, replace, s, whenChanged } from "./dom.js";
+import { mm } from "./words.js";
+
+const [WIDE, HIGH, LEFT, BOTTOM, TOP] = [460, 170, 42, 18, 8];
+const MOST = 40;
+
+export const drawHistory = whenChanged(({ measurements, toleranceMm }) => {
+  const shown = measurements.filter((m) => m.error_mm !== null && m.error_mm !== undefined).slice(-MOST);
+  const box = byId("history");
+  if (!shown.length) return replace(box, s("svg", { viewBox: "0 0 460 40" }, s("text", { x: 0, y: 20 }, "No measurement with a target yet.")));
+  const low = Math.min(0.01, toleranceMm / 4);
+  const high = Math.max(1, ...shown.map((m) => 1.3 * (m.error_mm + m.sigma_mm)));
+  const y = (value) => {
+    const part = Math.log(Math.max(value, low) / low) / Math.log(high / low);
+    return HIGH - BOTTOM - part * (HIGH - BOTTOM - TOP);
+  };
+  const x = (place) => LEFT + (shown.length === 1 ? 0.5 : place / (shown.length - 1)) * (WIDE - LEFT - 14) + 4;
+  const ticks = [0.01, 0.1, 1, 10, 100].filter((tick) => tick >= low && tick <= high);
+  const line = shown.map((m, k) => `${k ? "L" : "M"}${x(k)} ${y(m.error_mm)}`).join("");
+  replace(box, s("svg", { viewBox: `0 0 ${WIDE} ${HIGH}`, role: "img",
+    "aria-label": `Last error ${mm(shown.at(-1).error_mm, 3)} mm, tolerance ${mm(toleranceMm, 3)} mm` },
+  ticks.map((tick) => [
+    s("line", { x1: LEFT, x2: WIDE, y1: y(tick), y2: y(tick), class: "thin", stroke: "var(--line)" }),
+    s("text", { x: LEFT - 6, y: y(tick) + 4, "text-anchor": "end" }, String(tick)),
+  ]).flat(),
+  s("text", { x: 0, y: HIGH - 3 }, "mm"),
+  s("line", { x1: LEFT, x2: WIDE, y1: y(toleranceMm), y2: y(toleranceMm), class: "thin c-target dash" }),
+  s("text", { x: WIDE, y: y(toleranceMm) - 4, "text-anchor": "end" }, "tolerance"),
+  s("path", { d: line, class: "thin c-fiducial" }),
+  shown.map((m, k) => s("g", {},
+    s("title", {}, `${mm(m.error_mm, 3)} ± ${mm(m.sigma_mm, 3)} mm, ${m.n_frames} frame(s), ${m.method}`),
+    s("line", { x1: x(k), x2: x(k), y1: y(m.error_mm + m.sigma_mm), y2: y(m.error_mm - m.sigma_mm), class: "thin c-fiducial" }),
+    s("circle", { cx: x(k), cy: y(m.error_mm), r: 3.2, fill: "var(--fiducial)" }))),
+  s("text", { x: x(shown.length - 1), y: HIGH - 3, "text-anchor": "end" }, `measurement ${shown.at(-1).measurement_id}`)));
+});

@@ -1,0 +1,56 @@
+// The event stream: the state whenever it changes, each new event of the record, and a beat every
+// second, so that silence is noticed even when the connection looks open.
+
+const SILENT_MS = 2500;
+
+export class Live {
+  constructor({ onState, onEvent, onUp, onDown }) {
+    this.on = { onState, onEvent, onUp, onDown };
+    this.lastId = 0;
+    this.heardMs = performance.now();
+    this.isUp = false;
+    this.failures = 0;
+    setInterval(() => this.watch(), 250);
+  }
+
+  open(afterId) {
+    this.lastId = Math.max(afterId, this.lastId);
+    this.source?.close();
+    const source = new EventSource(`/api/v1/events/live?after=${this.lastId}`);
+    this.source = source;
+    source.addEventListener("state", (message) => this.heard(() => this.on.onState(JSON.parse(message.data))));
+    source.addEventListener("record", (message) => this.heard(() => {
+      this.lastId = Number(message.lastEventId) || this.lastId;
+      this.on.onEvent(JSON.parse(message.data));
+    }));
+    source.addEventListener("beat", () => this.heard(() => {}));
+    source.onerror = () => this.lost();
+  }
+
+  heard(act) {
+    this.heardMs = performance.now();
+    this.failures = 0;
+    if (!this.isUp) {
+      this.isUp = true;
+      this.on.onUp();
+    }
+    act();
+  }
+
+  lost() {
+    if (this.isUp) this.failedMs = performance.now();
+    this.isUp = false;
+    this.failures += 1;
+    this.on.onDown((performance.now() - this.heardMs) / 1000, this.failures);
+  }
+
+  watch() {
+    const silentMs = performance.now() - this.heardMs;
+    if (silentMs > SILENT_MS) this.lost();
+    // the browser gives up on some errors (a 401, a proxy's 502): ask again ourselves
+    if (this.source?.readyState === EventSource.CLOSED || silentMs > 4 * SILENT_MS) {
+      this.heardMs = Math.max(this.heardMs, performance.now() - 3 * SILENT_MS);
+      this.open(this.lastId);
+    }
+  }
+}

@@ -1,0 +1,94 @@
+// Ties the page together: who is looking, the event stream, and what is drawn from the state.
+
+import { get, stopRobot } from "./api.js";
+import { byId, setHidden, setText, whenChanged } from "./dom.js";
+import { drawHead, drawLights, showLost, showUp, startClock } from "./head.js";
+import { drawHistory } from "./history_plot.js";
+import { Images } from "./images.js";
+import { addEvent, drawAlarms, drawAside, drawCase, drawJog, drawPast } from "./lists.js";
+import { Live } from "./live.js";
+import { askForToken, leave, whoAmI } from "./login.js";
+import { act, Next } from "./next.js";
+import { drawNumbers } from "./numbers.js";
+import { drawStages } from "./stage_map.js";
+
+const page = { state: null, role: "viewer", measurements: [], connected: false };
+const images = new Images(byId("images"));
+const next = new Next();
+
+function draw(state) {
+  if (page.state && (page.state.case_uid !== state.case_uid || page.state.service_id !== state.service_id)) return location.reload();
+  page.state = state;
+  const { robot, question } = state;
+  drawHead(state, page.connected);
+  next.draw(state, page.role);
+  images.draw(state, page.role);
+  drawNumbers({ error: state.error, measurement: state.measurement, tolerance_mm: state.tolerance_mm, arrival: state.arrival, slice: state.slice });
+  drawStages({ robot: { travel_um: robot.travel_um, positions_um: robot.positions_um, position_certain: robot.position_certain }, plan: question?.plan });
+  drawAlarms(state.alarms ?? []);
+  drawJog({ positions_um: robot.positions_um, possible: page.role === "operator" && state.jog_possible });
+  drawCase({ description: state.case, case_uid: state.case_uid, role: page.role });
+  newAside([state.slices.quarantined, state.hold?.hold_id, page.role]);
+  newMeasurements([state.measurement?.measurement_id, state.measurement?.state, state.target_patient_mm]);
+}
+
+const quietly = (promise) => promise.catch(() => { /* the stream says when the service is back */ });
+const newAside = whenChanged(() => quietly(drawAside(page.state, page.role)));
+const newMeasurements = whenChanged(() => quietly(loadMeasurements()));
+
+async function loadMeasurements() {
+  const found = await get("/api/v1/measurements?newest=true&limit=60");
+  page.measurements = found.reverse();
+  drawHistory({ measurements: page.measurements, toleranceMm: page.state.tolerance_mm });
+}
+
+async function pressStop() {
+  const button = byId("stop");
+  try {
+    await stopRobot();
+    button.classList.add("sent");
+    setTimeout(() => button.classList.remove("sent"), 3000);
+    setText(byId("refusal"), "");
+  } catch (error) {
+    setText(byId("refusal"), `STOP could not be sent: ${error.message} Use the stop switch at the robot.`);
+  }
+}
+
+const live = new Live({
+  onState: draw,
+  onEvent: addEvent,
+  onUp: () => { page.connected = true; showUp(); },
+  onDown: async (seconds, failures) => {
+    page.connected = false;
+    showLost(seconds);
+    if (page.state) drawLights({ page: false, robot: page.state.robot, processes: page.state.processes });
+    if (failures === 4) await quietly(begin());
+  },
+});
+
+async function begin() {
+  let me;
+  try {
+    me = await whoAmI();
+  } catch (error) {
+    if (error.status === 401) return askForToken(begin);
+    throw error;
+  }
+  page.role = me.role;
+  setText(byId("who"), me.needs_token ? `${me.name} (${me.role})` : "");
+  setHidden(byId("leave"), !me.needs_token);
+  const events = await get("/api/v1/events?newest=true&limit=120");
+  byId("events").replaceChildren();
+  events.reverse().forEach(addEvent);
+  live.open(events.at(-1)?.event_id ?? 0);
+  quietly(drawPast());
+}
+
+byId("stop").onclick = pressStop;
+byId("leave").onclick = () => act(leave);
+// STOP from anywhere on the page, whatever has the focus, before anything else sees the key.
+addEventListener("keydown", (event) => {
+  if (event.key === "Escape") pressStop();
+}, { capture: true });
+startClock();
+begin().catch(() => showLost(NaN));

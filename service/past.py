@@ -1,0 +1,95 @@
+"""Looking back: errors to the targets of their time, and the cases beside this one."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from case_record.record import FILE_NAME, CaseRecord, CaseRecordError
+from case_record.rows import Measurement
+from service.bodies import CaseSummary, MeasurementBody
+from service.plane import ImagePlane
+
+_MOST_CASES = 200
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Since when which target (patient mm) was set, oldest first."""
+
+    since_s: tuple[float, ...]
+    patient_mm: tuple[tuple[float, float, float], ...]
+
+    def at(self, instant_s: float) -> tuple[float, float, float] | None:
+        place = bisect_right(self.since_s, instant_s)
+        return self.patient_mm[place - 1] if place else None
+
+    def body_of(self, row: Measurement) -> MeasurementBody:
+        """Return what the API says about a measurement."""
+        found = row.result or {}
+        return MeasurementBody(
+            measurement_id=row.measurement_id,
+            state=row.state,
+            method=row.method,
+            requested_s=row.requested_s,
+            finished_s=row.finished_s,
+            reason_code=row.reason_code,
+            reason=row.reason,
+            hold_ids=list(row.hold_ids),
+            n_frames=found.get("n_frames", 0),
+            patient_mm=found.get("patient_mm"),
+            sigma_mm=_sigma_mm(found["covariance_mm2"]) if found else None,
+            error_mm=self._error_mm(row),
+            snr=found.get("snr"),
+            has_reconstruction=bool(found.get("reconstruction")),
+        )
+
+    def _error_mm(self, row: Measurement) -> float | None:
+        target = self.at(row.requested_s)
+        if target is None or not row.result:
+            return None
+        plane = ImagePlane.from_json(row.result["plane"])
+        return float(np.linalg.norm(plane.from_patient(target) - np.array(row.result["plane_mm"])))
+
+
+def _sigma_mm(covariance_mm2: list[list[float]]) -> float:
+    return float(np.sqrt(np.trace(np.array(covariance_mm2)) / 2))
+
+
+def targets_over_time(record: CaseRecord) -> Targets:
+    events = record.events_of_kind("target_set")
+    return Targets(
+        tuple(event.wall_s for event in events),
+        tuple(tuple(event.body["patient_mm"]) for event in events),
+    )
+
+
+def past_cases(case_dir: Path) -> list[CaseSummary]:
+    """Every case folder beside `case_dir`, and itself, newest first; others are not touched."""
+    found = [case_dir, *(path.parent for path in case_dir.parent.glob(f"*/{FILE_NAME}"))]
+    summaries = []
+    for folder in sorted(set(found))[:_MOST_CASES]:
+        try:
+            with CaseRecord(folder) as record:
+                summaries.append(_summary(record, folder, folder == case_dir))
+        except CaseRecordError:
+            continue  # a record of a newer program, or none: not ours to show
+    return sorted(summaries, key=lambda case: -case.created_s)
+
+
+def _summary(record: CaseRecord, folder: Path, current: bool) -> CaseSummary:
+    case = record.case()
+    described = record.last_event("case_described")
+    return CaseSummary(
+        folder=folder.name,
+        case_uid=case.case_uid if case else "",
+        label=described.body["label"] if described else "",
+        created_s=case.created_s if case else 0.0,
+        slices=sum(record.count_slices().values()),
+        measurements=len(record.measurements()),
+        punctures=len(record.events_of_kind("puncture")),
+        current=current,
+    )

@@ -1,0 +1,178 @@
+"""Orders: everything that changes something. Each names who asked, and is carried out once."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from fastapi import APIRouter, Depends, Header, Request, Response
+
+from service.access import Identity
+from service.bodies import (
+    AnswerBody,
+    Ask,
+    AssignmentBody,
+    CaseBody,
+    HoldBody,
+    JogBody,
+    PointBody,
+    PunctureBody,
+    Started,
+    StopBody,
+)
+from service.control import ControlLoop
+from service.once import Once
+from service.problems import responses
+
+Key = Annotated[
+    str | None,
+    Header(
+        alias="Idempotency-Key",
+        min_length=1,
+        max_length=128,
+        description="A command sent again under the same key is not carried out again.",
+    ),
+]
+_REFUSALS = responses(400, 401, 403, 409, 413, 422, 429, 503)
+_WITH_ID = responses(400, 401, 403, 404, 409, 413, 422, 429, 503)
+
+
+def identity_of(request: Request) -> Identity:
+    """Who asks, as the gate found out."""
+    identity: Identity = request.state.identity
+    return identity
+
+
+Caller = Annotated[Identity, Depends(identity_of)]
+
+
+class Orders:
+    """Hands orders to the control loop under the name of whoever is logged in."""
+
+    def __init__(self, loop: ControlLoop) -> None:
+        self._loop = loop
+        self._once = Once()
+
+    def carry_out(
+        self, caller: Identity, key: str | None, name: str, body: Ask, **path: Any
+    ) -> Any:
+        """Carry out a command of the control loop; `body` and `path` are its arguments."""
+        arguments = {**body.model_dump(), **path, "by": who(caller, body.by)}
+        what = f"{name} {body.model_dump_json()} {path}"
+        return self._once.carry_out(
+            caller.name, key, what, lambda: self._loop.call(name, arguments)
+        )
+
+
+def who(caller: Identity, claimed: str) -> str:
+    """The name that is recorded: a token's own name wins over what the body says."""
+    return caller.name or claimed
+
+
+def stop_router(loop: ControlLoop) -> APIRouter:
+    """STOP: handled in the server's own loop, behind no queue, with any body or none."""
+    router = APIRouter(tags=["robot"])
+
+    @router.post(
+        "/api/v1/stop",
+        status_code=202,
+        response_class=Response,
+        responses=responses(401, 413),
+        openapi_extra={
+            "requestBody": {
+                "required": False,
+                "content": {"application/json": {"schema": StopBody.model_json_schema()}},
+            }
+        },
+    )
+    async def stop(request: Request, caller: Caller) -> Response:
+        """Stop the robot at once; latched until re-armed. Viewers may do this too."""
+        body = _stop_body(await request.body())
+        loop.stop(who(caller, body.by), emergency=body.emergency)
+        return Response(status_code=202)
+
+    return router
+
+
+def _stop_body(text: bytes) -> StopBody:
+    """What can be understood of the body; whatever it is, it does not keep the STOP back."""
+    try:
+        return StopBody.model_validate_json(text)
+    except ValueError:
+        return StopBody()
+
+
+def command_router(loop: ControlLoop) -> APIRouter:
+    router = APIRouter()
+    orders = Orders(loop)
+
+    @router.post("/api/v1/reset", tags=["robot"], status_code=204, responses=_REFUSALS)
+    def reset(body: Ask, caller: Caller, key: Key = None) -> None:
+        """Clear a latched stop, take the positions as they stand, and arm."""
+        orders.carry_out(caller, key, "reset", body)
+
+    @router.post("/api/v1/jog", tags=["robot"], status_code=202, responses=_REFUSALS)
+    def jog(body: JogBody, caller: Caller, key: Key = None) -> Started:
+        """Move one axis by hand; only while no procedure runs and motion is not locked."""
+        return Started(procedure_id=orders.carry_out(caller, key, "jog", body))
+
+    @router.post("/api/v1/calibration", tags=["procedure"], status_code=202, responses=_REFUSALS)
+    def calibration(body: Ask, caller: Caller, key: Key = None) -> Started:
+        """Start the calibration."""
+        return Started(procedure_id=orders.carry_out(caller, key, "start_calibration", body))
+
+    @router.put("/api/v1/target", tags=["procedure"], status_code=204, responses=_REFUSALS)
+    def target(body: PointBody, caller: Caller, key: Key = None) -> None:
+        """Set where the fiducial is to be, patient mm (LPS)."""
+        orders.carry_out(caller, key, "set_target", body)
+
+    @router.put("/api/v1/entry", tags=["procedure"], status_code=204, responses=_REFUSALS)
+    def entry(body: PointBody, caller: Caller, key: Key = None) -> None:
+        """Set the planned skin point, patient mm (LPS)."""
+        orders.carry_out(caller, key, "set_entry", body)
+
+    @router.post("/api/v1/approach", tags=["procedure"], status_code=202, responses=_REFUSALS)
+    def approach(body: Ask, caller: Caller, key: Key = None) -> Started:
+        """Start the approach to the target."""
+        return Started(procedure_id=orders.carry_out(caller, key, "start_approach", body))
+
+    @router.post("/api/v1/answer", tags=["procedure"], status_code=204, responses=_REFUSALS)
+    def answer(body: AnswerBody, caller: Caller, key: Key = None) -> None:
+        """Answer the open question, for instance CONFIRM MOVE; void if anything has changed."""
+        orders.carry_out(caller, key, "answer", body)
+
+    @router.post("/api/v1/abort", tags=["procedure"], status_code=204, responses=_REFUSALS)
+    def abort(body: Ask, caller: Caller, key: Key = None) -> None:
+        """End the running procedure; the robot stays where it is."""
+        orders.carry_out(caller, key, "abort", body)
+
+    @router.post("/api/v1/puncture", tags=["procedure"], status_code=204, responses=_REFUSALS)
+    def puncture(body: PunctureBody, caller: Caller, key: Key = None) -> None:
+        """Record the puncture."""
+        orders.carry_out(caller, key, "puncture", body)
+
+    @router.post("/api/v1/needle-out", tags=["procedure"], status_code=204, responses=_REFUSALS)
+    def needle_out(body: Ask, caller: Caller, key: Key = None) -> None:
+        """The needle is out: unlock motion."""
+        orders.carry_out(caller, key, "needle_out", body)
+
+    @router.put("/api/v1/case", tags=["record"], status_code=204, responses=_REFUSALS)
+    def case(body: CaseBody, caller: Caller, key: Key = None) -> None:
+        """Write down what the case is called, who operates, and a note."""
+        orders.carry_out(caller, key, "describe_case", body)
+
+    @router.post(
+        "/api/v1/slices/{slice_id}/assignment",
+        tags=["record"],
+        status_code=204,
+        responses=_WITH_ID,
+    )
+    def assignment(slice_id: int, body: AssignmentBody, caller: Caller, key: Key = None) -> None:
+        """Overrule the listener about one slice."""
+        orders.carry_out(caller, key, "assign_slice", body, slice_id=slice_id)
+
+    @router.post("/api/v1/acquisition", tags=["procedure"], status_code=204, responses=_WITH_ID)
+    def acquisition(body: HoldBody, caller: Caller, key: Key = None) -> None:
+        """The slices of a hold were acquired (rooms where the operator confirms acquisitions)."""
+        orders.carry_out(caller, key, "confirm_acquisition", body)
+
+    return router

@@ -1,0 +1,99 @@
+"""Who operates the virtual scanner: reads off the service what is to be acquired, and does it."""
+
+import contextlib
+import threading
+from collections.abc import Callable
+from dataclasses import asdict
+from pathlib import Path
+
+import httpx
+from pydantic import ValidationError
+
+from simulator.config import VirtualRoom, VirtualRoomError
+from simulator.outbox import Delivery, Outbox
+from simulator.scanner import AcquisitionRequest, Note, VirtualScanner
+from simulator.truth_client import TruthError
+from simulator.truth_file import TruthFile
+
+
+def read_request(http: httpx.Client, service_url: str) -> AcquisitionRequest | None:
+    """What the service asks for now. Raises httpx.HTTPError or ValueError (not understood)."""
+    answer = http.get(f"{service_url.rstrip('/')}/api/v1/state")
+    answer.raise_for_status()
+    state = answer.json()
+    if not isinstance(state, dict) or "acquisition_request" not in state:
+        raise ValueError("the state has no field 'acquisition_request'")
+    if state["acquisition_request"] is None:
+        return None
+    try:
+        return AcquisitionRequest.model_validate(state["acquisition_request"])
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        key = ".".join(str(part) for part in first["loc"])
+        raise ValueError(f"acquisition_request.{key}: {first['msg']}") from None
+
+
+def operate(
+    room: VirtualRoom,
+    stop: threading.Event,
+    note: Note,
+    ready: Callable[[], None] = lambda: None,
+) -> None:
+    """Play the scanner and its operator until `stop` is set; `ready` is called once it begins.
+
+    Raises VirtualRoomError if the room has no scanner or the truth file cannot be written.
+    """
+    if room.scanner is None:
+        raise VirtualRoomError("virtual.scanner: missing table")
+    settings = room.scanner
+    with contextlib.closing(TruthFile(Path(settings.truth_file))) as truth:
+        report = _reporter(truth, note)
+        say = _once_in_a_row(note)
+        with httpx.Client(timeout=2.0, trust_env=False) as http, Outbox(settings, report) as outbox:
+            scanner = VirtualScanner(room, truth, outbox, say)
+            ready()
+            served: set[str] = set()
+            while not stop.wait(settings.poll_s):
+                try:
+                    _operate_once(scanner, read_request(http, settings.service_url), served, stop)
+                    say("")
+                except TruthError as error:
+                    say(str(error))
+                except (httpx.HTTPError, httpx.InvalidURL, ValueError) as error:
+                    say(f"{settings.service_url}: {error}")
+
+
+def _operate_once(
+    scanner: VirtualScanner,
+    request: AcquisitionRequest | None,
+    served: set[str],
+    stop: threading.Event,
+) -> None:
+    if request is not None and request.request_id not in served:
+        scanner.serve(request, stop)
+        served.add(request.request_id)
+    else:
+        scanner.scan_if_moving(stop)
+    scanner.release_held_back()
+
+
+def _reporter(truth: TruthFile, note: Note) -> Callable[[Delivery], None]:
+    def report(delivery: Delivery) -> None:
+        truth.write("delivery", **asdict(delivery))
+        if not delivery.sent:
+            note(f"{delivery.sop_instance_uid} could not be delivered: {delivery.reason}")
+
+    return report
+
+
+def _once_in_a_row(note: Note) -> Note:
+    """The same line is said once, until something else has been said; '' says nothing."""
+    last = ""
+
+    def say(line: str) -> None:
+        nonlocal last
+        if line and line != last:
+            note(line)
+        last = line
+
+    return say

@@ -1,0 +1,50 @@
+"""Commands over a line with every fault and restarts of both sides: no harm, and agreement."""
+
+import json
+from pathlib import Path
+
+import pytest
+from campaign import Campaign, again_asked_moves_nothing
+
+SEEDS = (1, 2, 3)
+SHORT_COMMANDS = 600
+LONG_COMMANDS = 100_000
+COMMANDS_A_SEED = 2_000
+
+
+def run(folder: Path, seed: int, commands: int) -> Campaign:
+    campaign = Campaign(folder, seed)
+    findings = campaign.run(commands)
+    assert sum(findings.harm.values()) == 0, (seed, findings)
+    assert findings.commands >= commands
+    assert again_asked_moves_nothing(campaign, sample=min(50, commands))
+    return campaign
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_no_fault_of_line_or_process_moves_wrongly_or_twice(tmp_path: Path, seed: int):
+    campaign = run(tmp_path, seed, SHORT_COMMANDS)
+    findings = campaign.findings
+    # The campaign proves nothing unless it really did all this.
+    assert findings.states["DONE"] > SHORT_COMMANDS / 2, findings
+    assert {"REFUSED", "STOPPED", "FAILED"} <= set(findings.states), findings
+    assert findings.events["link lost"] > 3, findings
+    assert campaign.room.restarts > 5
+    assert campaign.room.to_bridge.frames_hit > 100
+    assert len(campaign.room.stops_delivered) > 5
+
+
+@pytest.mark.soak
+def test_no_harm_in_a_hundred_thousand_commands(tmp_path: Path):
+    total: dict[str, int] = {}
+    commands = 0
+    for seed in range(1000, 1000 + LONG_COMMANDS // COMMANDS_A_SEED):
+        folder = tmp_path / str(seed)
+        findings = run(folder, seed, COMMANDS_A_SEED).findings
+        commands += findings.commands
+        for counter in (findings.states, findings.events):
+            for name, count in counter.items():
+                total[name] = total.get(name, 0) + count
+        print(json.dumps({"seed": seed, "commands": commands, **findings.harm}), flush=True)
+    print(json.dumps(total))
+    assert commands >= LONG_COMMANDS

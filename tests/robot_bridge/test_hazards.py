@@ -1,0 +1,351 @@
+"""The hazards of the design, each injected into a real daemon with motors that really run.
+
+H3, H4 also: test_fault_injection, test_two_sides, test_messages_and_framing. H5, H6, H8 also:
+test_daemon. H13: the times are measured in benchmarks/link.py.
+"""
+
+import os
+import random
+import threading
+import time
+from pathlib import Path
+
+import cbor2
+import pytest
+from bridge_room import AXES, BridgeRoom, bridge_room, wait_for
+
+from robot_bridge import framing
+from robot_bridge.client import BridgeClient, LinkLostError, RefusedError
+from robot_bridge.framing import Deframer, Frame, FrameCounters, StopAckFrame
+from robot_bridge.messages import (
+    PROTOCOL_VERSION,
+    SCHEMA,
+    Answer,
+    Arm,
+    DeclarePosition,
+    Hello,
+    HelloRequest,
+    Message,
+    Move,
+    NoSession,
+    SetPhase,
+    pack,
+    unpack,
+)
+from robot_bridge.phases import WorkPhase
+from robot_bridge.transport import SerialTransport
+from simulator.serial_line import LineFaults
+
+FAR = dict.fromkeys(AXES, 14_000)
+
+
+class RawService:
+    """A service that says whatever it likes: bytes on the line, without the client's manners."""
+
+    def __init__(self, url: str) -> None:
+        self.line = SerialTransport(url, 115200)
+        self.session = 0
+        self.sequence = 0
+        self._deframer = Deframer(FrameCounters())
+        self._hello_s = 0.0
+
+    def say_hello(self) -> Hello:
+        nonce = random.getrandbits(50)
+        hello = HelloRequest(nonce, "raw", PROTOCOL_VERSION, SCHEMA)
+        answer = None
+        until_s = time.monotonic() + 15.0
+        while answer is None and time.monotonic() < until_s:  # the daemon may be starting
+            self.line.write(framing.encode(Frame(hello.KIND, 0, 0, pack(hello))))
+            answer = self._receive_or_none(0.3, Hello)
+        assert isinstance(answer, Hello)
+        self.session, self.boot_id = answer.session, answer.boot_id
+        self._hello_s, self._hello_ms = time.monotonic(), answer.now_ms
+        return answer
+
+    @property
+    def now_ms(self) -> int:
+        """The bridge's clock, a little behind."""
+        return self._hello_ms + round((time.monotonic() - self._hello_s) * 1000) - 20
+
+    def receive(self, *kinds: type[Message]) -> Message:
+        message = self._receive_or_none(10.0, *kinds)
+        assert message is not None, f"no {kinds}"
+        return message
+
+    def _receive_or_none(self, timeout_s: float, *kinds: type[Message]) -> Message | None:
+        until_s = time.monotonic() + timeout_s
+        while time.monotonic() < until_s:
+            for frame in self._deframer.feed(self.line.read(0.05)):
+                if isinstance(frame, Frame) and frame.kind in {kind.KIND for kind in kinds}:
+                    return unpack(frame.kind, frame.payload)
+        return None
+
+    def acknowledged(self, timeout_s: float) -> bool:
+        until_s = time.monotonic() + timeout_s
+        while time.monotonic() < until_s:
+            frames = self._deframer.feed(self.line.read(0.02))
+            if any(isinstance(frame, StopAckFrame) for frame in frames):
+                return True
+        return False
+
+    def ask(self, request: Message, payload: bytes | None = None) -> Answer:
+        self.sequence += 1
+        payload = pack(request) if payload is None else payload
+        frame = Frame(request.KIND, self.session, self.sequence, payload)
+        self.line.write(framing.encode(frame))
+        answer = self.receive(Answer)
+        assert isinstance(answer, Answer)
+        return answer
+
+    def make_ready(self) -> str:
+        """Armed in MANUAL at zero; returns the motion that a move must be based on."""
+        zero = dict.fromkeys(AXES, 0)
+        assert self.ask(DeclarePosition(zero, "raw", self.now_ms)).code == "ok"
+        assert self.ask(SetPhase("MANUAL", "raw", self.now_ms)).code == "ok"
+        assert self.ask(Arm("raw", 0, self.now_ms)).code == "ok"
+        return f"declared:{self.boot_id}:1"
+
+    def move(self, command_id: str, setpoints_um: dict, based_on: str) -> Answer:
+        return self.ask(Move(command_id, setpoints_um, None, based_on, self.now_ms))
+
+
+def never_moved(room: BridgeRoom) -> bool:
+    time.sleep(0.2)
+    return not room.controllers.moving and all(
+        abs(um) < 5 for um in room.controllers.positions_um().values()
+    )
+
+
+def test_h3_a_move_frame_repeated_by_the_line_moves_once(tmp_path: Path):
+    with bridge_room(tmp_path, LineFaults(duplicate=1.0)) as room:
+        room.start_daemon()
+        client = room.ready_client()
+        for number in range(3):
+            assert client.move(f"m{number}", dict.fromkeys(AXES, 300 * number), None).done
+        starts = room.controllers.bus.lines_received
+        assert client.move("m2", dict.fromkeys(AXES, 600), None).done
+        assert room.controllers.positions_um() == pytest.approx(dict.fromkeys(AXES, 600), abs=20)
+        assert starts > 0
+        journal = (tmp_path / "state" / "bridge_journal.jsonl").read_text()
+        assert journal.count('"kind":"begin"') == 3
+
+
+def test_h4_garbage_chatter_echo_and_half_frames_move_nothing(tmp_path: Path):
+    rng = random.Random(4)
+    with bridge_room(tmp_path) as room:
+        room.start_daemon()
+        raw = RawService(room.line.far)
+        raw.say_hello()
+        move = Move("evil", FAR, None, raw.make_ready(), raw.now_ms)
+        frame = framing.encode(Frame(Move.KIND, raw.session, raw.sequence + 1, pack(move)))
+        for _ in range(200):
+            damaged = bytearray(frame)
+            place = rng.randrange(1, len(frame) - 1)
+            match rng.randrange(4):
+                case 0:
+                    damaged[place] ^= 1 << rng.randrange(8)
+                case 1:
+                    del damaged[place:]  # half a frame
+                case 2:
+                    damaged = bytearray(rng.randbytes(60))  # another device
+                case 3:
+                    damaged = bytearray(b"\0X1T14000,1500\r\0")  # chatter of a motor bus
+            raw.line.write(bytes(damaged))
+        assert never_moved(room)
+        health = wait_for_health(room, lambda h: int(h["frames"]["bad"]) > 100)
+        assert health["commands"] == {}
+
+
+def wait_for_health(room: BridgeRoom, condition) -> dict:
+    wait_for(lambda: condition(room.status_file()), 5, "the status file")
+    return room.status_file()
+
+
+def test_h7_a_controller_that_restarts_leaves_the_position_uncertain(tmp_path: Path):
+    with bridge_room(tmp_path) as room:
+        room.start_daemon()
+        client = room.ready_client()
+        assert client.move("a", dict.fromkeys(AXES, 500), None).done
+        room.controllers.power_cycle()
+        wait_for(lambda: client.pump(0.05) or not client.status.position_certain, 5, "uncertain")
+        time.sleep(0.5)
+        client.pump(0.1)
+        assert not client.status.armed
+        outcome = client.move("b", dict.fromkeys(AXES, 600), None)
+        assert outcome.code in ("stop_latched", "motor_fault", "position_uncertain")
+        client.rearm("test")
+        client.set_phase(WorkPhase.MANUAL, "test")
+        outcome = client.move("c", dict.fromkeys(AXES, 600), None)
+        assert outcome.code == "position_uncertain"
+
+
+def test_h7_frames_of_an_old_session_are_answered_with_no_session(tmp_path: Path):
+    with bridge_room(tmp_path) as room:
+        daemon = room.start_daemon()
+        raw = RawService(room.line.far)
+        boot = raw.say_hello()
+        old = Move("old", FAR, None, raw.make_ready(), raw.now_ms)
+        frame = framing.encode(Frame(Move.KIND, raw.session, raw.sequence + 1, pack(old)))
+        daemon.kill()
+        daemon.wait()
+        room.start_daemon()
+        new_boot = raw.say_hello()
+        assert new_boot.boot_id != boot.boot_id
+        assert not new_boot.position_certain
+        raw.line.write(frame)
+        answer = raw.receive(NoSession)
+        assert isinstance(answer, NoSession)
+        assert answer.boot_id == new_boot.boot_id
+        assert never_moved(room)
+
+
+OUTSIDE = [
+    ({**FAR, "xt": 15_001}, "beyond_travel", "'xt': 15001 um is outside its travel"),
+    ({**FAR, "yb": -15_001}, "beyond_travel", "'yb': -15001 um"),
+    ({**FAR, "yb": 2**31 - 1}, "beyond_travel", "'yb': 2147483647"),
+    ({"xt": 0, "yt": 0, "xb": 0}, "missing_axis", "'yb' has no setpoint"),
+    ({**FAR, "zz": 0}, "unknown_axis", "'zz' is not one of"),
+    ({**FAR, "xt": float("nan")}, "malformed", "Move.setpoints_um: axis xt: nan"),
+    ({**FAR, "xt": float("inf")}, "malformed", "inf"),
+    ({**FAR, "xt": 1e9}, "malformed", "1000000000.0"),
+    ({**FAR, "xt": 2**70}, "malformed", "xt"),
+    ({**FAR, "xt": None}, "malformed", "None"),
+    ({}, "missing_axis", "'xt' has no setpoint"),
+]
+
+
+def test_h9_nothing_beyond_travel_and_no_nonsense_ever_moves(tmp_path: Path):
+    with bridge_room(tmp_path) as room:
+        room.start_daemon()
+        raw = RawService(room.line.far)
+        raw.say_hello()
+        base = raw.make_ready()
+        for number, (setpoints_um, code, text) in enumerate(OUTSIDE):
+            move = Move(f"h9-{number}", setpoints_um, None, base, raw.now_ms)
+            payload = cbor2.dumps(list(move.__dict__.values()))
+            answer = raw.ask(move, payload)
+            assert answer.code == code, (setpoints_um, answer)
+            assert text in answer.text
+        assert never_moved(room)
+        # The line and the session are as good as before.
+        assert raw.move("inside", dict.fromkeys(AXES, 0), base).state == "ACCEPTED"
+        health = wait_for_health(room, lambda h: sum(h["refused"].values()) >= len(OUTSIDE))
+        assert health["refused"]["beyond_travel"] == 3
+
+
+def test_h2_a_move_resting_on_an_outdated_measurement_is_refused(tmp_path: Path):
+    with bridge_room(tmp_path) as room:
+        room.start_daemon()
+        client = room.ready_client()
+        measured_after = client.status.last_motion
+        assert client.move("a", dict.fromkeys(AXES, 300), "m1").done
+        by_base = client.move("b", dict.fromkeys(AXES, 400), "m2", based_on_motion=measured_after)
+        by_use = client.move("c", dict.fromkeys(AXES, 400), "m1")
+        assert by_base.code == by_use.code == "outdated_measurement"
+        assert "outdated measurement" in by_base.text
+        assert room.controllers.positions_um() == pytest.approx(dict.fromkeys(AXES, 300), abs=20)
+
+
+def test_h13_stop_works_without_a_session_and_from_another_program(tmp_path: Path):
+    with bridge_room(tmp_path) as room:
+        room.start_daemon()
+        client = room.ready_client()
+        thread = threading.Thread(target=_move_until_stopped, args=(client,), daemon=True)
+        thread.start()
+        wait_for(lambda: room.controllers.moving, 5, "the motors to turn")
+        time.sleep(0.1)
+        line = os.open(room.line.far, os.O_RDWR | os.O_NOCTTY)
+        os.write(line, framing.encode_stop(1, False))  # thirteen bytes, no session
+        os.close(line)
+        wait_for(lambda: not room.controllers.moving, 0.5, "standstill")
+        thread.join(10)
+        assert max(room.controllers.positions_um().values()) < 13_000
+
+
+def _move_until_stopped(client: BridgeClient) -> None:
+    try:
+        client.move("long", FAR, None)
+    except LinkLostError:
+        return
+
+
+def test_h13_stop_overtakes_a_flood_of_other_frames(tmp_path: Path):
+    with bridge_room(tmp_path) as room:
+        room.start_daemon()
+        raw = RawService(room.line.far)
+        raw.say_hello()
+        assert raw.move("long", FAR, raw.make_ready()).state == "ACCEPTED"
+        wait_for(lambda: room.controllers.moving, 5, "the motors to turn")
+        flood = b"".join(
+            framing.encode(Frame(0x13, raw.session, 100 + n, b"\x80")) for n in range(60)
+        )
+        raw.line.write(flood + framing.encode_stop(2, False))
+        wait_for(lambda: not room.controllers.moving, 0.5, "standstill")
+        assert raw.acknowledged(2.0)
+        assert max(room.controllers.positions_um().values()) < 13_000
+
+
+def test_h13_stop_works_while_the_controllers_answer_nothing(tmp_path: Path):
+    with bridge_room(tmp_path) as room:
+        room.start_daemon()
+        client = room.ready_client()
+        thread = threading.Thread(target=_move_until_stopped, args=(client,), daemon=True)
+        thread.start()
+        wait_for(lambda: room.controllers.moving, 5, "the motors to turn")
+        time.sleep(0.1)
+        room.controllers.bus.faults.drop_probability = 1.0
+        client.request_stop()
+        wait_for(lambda: not room.controllers.moving, 0.5, "standstill")
+        thread.join(15)
+        assert max(room.controllers.positions_um().values()) < 13_000
+        room.controllers.bus.faults.drop_probability = 0.0
+
+
+def test_h13_a_peer_with_another_schema_can_still_stop(tmp_path: Path):
+    with bridge_room(tmp_path) as room:
+        room.start_daemon()
+        raw = RawService(room.line.far)
+        raw.say_hello()
+        hello = HelloRequest(5, "older", PROTOCOL_VERSION, "0" * 16)
+        raw.line.write(framing.encode(Frame(hello.KIND, 0, 0, pack(hello))))
+        answer = raw.receive(Hello)
+        assert isinstance(answer, Hello)
+        assert answer.code == "schema_mismatch"
+        raw.line.write(framing.encode_stop(3, False))
+        assert raw.acknowledged(2.0)
+        assert wait_for_health(room, lambda h: h["stopped"])["stop_reason"] == "operator_stop"
+
+
+def test_the_lock_set_in_motion_stops_it(tmp_path: Path):
+    with bridge_room(tmp_path) as room:
+        room.start_daemon()
+        client = room.ready_client()
+        raw_outcome: list = []
+        done = threading.Event()
+
+        def lock_when_moving(state, status) -> None:
+            if not done.is_set():
+                done.set()
+                time.sleep(0.1)
+                client.set_insertion_lock(True, "test")
+
+        raw_outcome.append(client.move("a", FAR, None, lock_when_moving))
+        assert raw_outcome[0].code == "locked_in_motion"
+        assert max(room.controllers.positions_um().values()) < 13_000
+        client.arm("test")
+        assert client.move("b", dict.fromkeys(AXES, 0), None).code == "insertion_locked"
+
+
+def test_a_stalled_axis_fails_the_move_and_latches(tmp_path: Path):
+    with bridge_room(tmp_path) as room:
+        room.start_daemon()
+        client = room.ready_client()
+        room.controllers.all[1].faults.stalled = True
+        outcome = client.move("a", dict.fromkeys(AXES, 2000), None)
+        assert outcome.state == "FAILED"
+        assert outcome.code == "motor_fault"
+        assert "yt" in outcome.text
+        assert client.status.stopped
+        room.controllers.all[1].faults.stalled = False
+        with pytest.raises(RefusedError):
+            client.arm("test")

@@ -1,0 +1,88 @@
+"""Where the manuals are silent or contradicted, the driver works with either answer, unchanged."""
+
+import itertools
+
+import pytest
+from pmd_rig import finish, opened, rig, wait_until
+
+from robot_bridge.emulator_axis import Motor
+from robot_bridge.emulator_switches import Switches
+
+SINGLE = [
+    Switches(terminator="cr"),
+    Switches(terminator="lf"),
+    Switches(terminator="crlf"),
+    Switches(run_answer="222"),
+    Switches(flash_answer_comma=False),
+    Switches(hex_case="upper"),
+    Switches(own_echo=True),
+    Switches(m6_parks=False),
+    Switches(overspeed="refuse"),
+    Switches(target_beyond_limit="refuse"),
+    Switches(broadcast_stop=False),
+    Switches(encoder_type_description=False),
+    Switches(bare_status=False),
+]
+COMBINED = [
+    Switches(terminator=terminator, run_answer="222", hex_case="upper", own_echo=echo)
+    for terminator, echo in itertools.product(("mixed", "lf", "crlf"), (False, True))
+]
+
+
+def differing(switches: Switches) -> str:
+    standard = Switches()
+    changed = [
+        f"{name}={value}"
+        for name, value in vars(switches).items()
+        if value != getattr(standard, name)
+    ]
+    return ",".join(changed) or "standard"
+
+
+def works_in_whole(switches: Switches) -> None:
+    """Opening, moves both ways in either kind of loop, parking, a move from parked, stopping."""
+    with rig(switches=switches) as made, opened(made, "mixed") as motors:
+        for setpoint_um in (900, -300):
+            motors.move_to({"xt": setpoint_um, "yt": -setpoint_um})
+            status = finish(motors)
+            assert status.fault is None, status
+            assert status.reached
+            assert made.position_um(1) == pytest.approx(setpoint_um, abs=1)
+            assert made.position_um(2) == pytest.approx(-setpoint_um, abs=1)
+        motors.park()
+        wait_until(motors, lambda s: s.parked)
+        motors.move_to({"xt": 0, "yt": 0})
+        assert finish(motors).reached
+        motors.stop()
+        assert motors.poll().certain
+
+
+@pytest.mark.parametrize("switches", SINGLE, ids=differing)
+def test_each_switch_alone(switches: Switches):
+    works_in_whole(switches)
+
+
+@pytest.mark.parametrize("switches", COMBINED, ids=differing)
+def test_combinations_of_switches(switches: Switches):
+    works_in_whole(switches)
+
+
+def test_the_other_model():
+    with (
+        rig(motor=Motor("PMD301", firmware="V20")) as made,
+        opened(made, "mixed") as motors,
+    ):
+        motors.move_to({"xt": 700, "yt": 100})
+        assert finish(motors).reached
+        assert made.position_um(1) == pytest.approx(700, abs=1)
+
+
+@pytest.mark.parametrize("broadcast_works", [True, False])
+def test_stop_needs_no_broadcast(broadcast_works: bool):
+    switches = Switches(broadcast_stop=broadcast_works)
+    with rig(switches=switches, speed_factor=1.0) as made, opened(made) as motors:
+        motors.move_to({"xt": 15_000, "yt": 15_000})
+        wait_until(motors, lambda s: s.readback_um["yt"] > 300)
+        motors.stop()
+        with made.lock:
+            assert not any(c.moving for c in made.bus.controllers)
