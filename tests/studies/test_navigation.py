@@ -85,7 +85,6 @@ def test_the_report_is_json_csv_and_figures(mri, tmp_path):
         (["--trials", "1"], "--trials is 1"),
         (["--snr", "nan"], "--snr is nan"),
         (["--step-scatter", "-1"], "--step-scatter is -1"),
-        (["--scheduler", "tcp://127.0.0.1:1"], "no Dask scheduler"),
     ],
 )
 def test_bad_options_end_in_one_line_and_exit_code_2(words, said):
