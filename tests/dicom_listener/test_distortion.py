@@ -7,7 +7,7 @@ from dicom_listener.clock import OffsetBounds
 from dicom_listener.reasons import Reason
 from dicom_listener.usable import SliceRules, why_not_usable
 
-FIRST = HoldWindow(1, 1, 900.0, 950.0, 1)
+FIRST = HoldWindow(1, 1, 900.0, 950.0, 0)
 STANDING = HoldWindow(2, 2, 990.0, None, 2)
 
 
