@@ -37,6 +37,7 @@ Array = NDArray[np.float64]
 _OUTLIER_SIGMA = 4.5
 _OUTLIER_NEIGHBOUR_SIGMA = 2.5
 _MAX_ITERATIONS = 40
+_LONGEST_STEP_PX = 0.7  # of centre and radius
 _MAX_ROUNDS = 6
 _SAME_SIGMA = 0.1  # relative change of the noise level that leaves the weights as they are
 _SETTLED = 1e-4  # expected change of chi2, so a step of 0.01 sigma in any parameter
@@ -302,7 +303,8 @@ def _damped_step(
         hessian = (gauss_newton + damper)[chosen]
     step = np.zeros(free.size)
     step[free] = np.linalg.solve(hessian, gradient[free])
-    return step
+    # beyond a pixel the linearised edge says nothing: a long step is only its direction
+    return step * min(1.0, _LONGEST_STEP_PX / max(float(np.max(np.abs(step[:AMPLITUDE]))), 1e-12))
 
 
 def _summary(

@@ -7,6 +7,7 @@ the frames agree with their shifts.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,18 +35,20 @@ from sr_engine.match import best_matches, correlate, radius_grid
 from sr_engine.model import DISC, Patch, Shape
 from sr_engine.noise import NoiseKind
 from sr_engine.psf import Psf
+from sr_engine.recognise import recognise_psf
 from sr_engine.signal import Pixels
 
 Array = NDArray[np.float64]
 
 MARGIN_PX = 4.0  # of surroundings that are fitted with the object
+INNER_BAND_PX = 10.0  # inside of the edge
 SEARCH_PX = 3.0  # how far from a given start the object may be
 DEFAULT_RADII_PX = (1.5, 12.0)
 LEAST_EXPLAINED = 0.3  # of the variance near a given start, by the matched filter
 AMBIGUOUS_RATIO = 0.9  # a second candidate of this share of the best score is as good
 MINIMUM_EXPLAINED = 60.0  # chi2 that an object must take away to be one
 CONSISTENCY_P = 1e-5  # frames that agree look as bad as this once in 100,000 measurements
-MODEL_FLOOR_PX = 0.005  # what an imperfect point spread may do to one frame; check only
+MODEL_FLOOR_PX = 0.01  # what an imperfect point spread may do to one frame; check only
 FOLDING_MARGIN_PX = 6.0
 LARGEST_PERIOD_PX = 160  # ringing that comes round from farther away is below 1e-4 of the object
 
@@ -89,7 +92,7 @@ def localize(
     start_px: ArrayLike | None = None,
     radius_px: tuple[float, float] | float | None = None,
     method: str = "ml",
-    psf: Psf | None = None,
+    psf: Psf | Literal["auto"] | None = None,
     shape: Shape = DISC,
     wall_px: float | None = None,
     noise: NoiseKind | None = None,
@@ -109,7 +112,8 @@ def localize(
     radius_px: (low, high), or one number within 25 %; default 1.5 to 12 px.
     method: "ml", or one of the paper's, "sr", "bicubic", "base" (see `paper`), which heed
       start_px, radius_px, gate_px and saturation_level alone.
-    psf: point spread; default flat k-space. noise: "rician", or "gaussian" (default for a psf
+    psf: point spread; default flat k-space; "auto" recognises it in the first frame (slow, see
+      `recognise`). noise: "rician", or "gaussian" (default for a psf
       that folds, a camera, and where pixels are negative).
     sigma: noise std per channel, where known.
     wall_px: expected thickness of a shell about the object, where it has one.
@@ -133,10 +137,11 @@ def localize(
     shifts = checked_shifts(shifts_px, len(stack))
     radii = checked_radii(radius_px) or DEFAULT_RADII_PX
     start = checked_point(start_px, "start_px")
+    guess = _first_guess(stack[0], start, shifts[0], radii)
+    if psf == "auto":
+        psf = _recognised(stack[0], guess, shifts[0], radii, noise)
     psf = psf or Psf()
     noise = noise or noise_kind(stack, psf)
-
-    guess = _first_guess(stack[0], start, shifts[0], radii)
     fits: list[DiscFit] = []
     bounds = (0.8 * radii[0], 1.2 * radii[1])
     for frame, shift in zip(stack, shifts, strict=True):
@@ -157,6 +162,19 @@ def localize(
     return result
 
 
+def _recognised(
+    frame: Array,
+    guess: tuple[float, float, float],
+    shift: Array,
+    radii: tuple[float, float],
+    noise: NoiseKind | None,
+) -> Psf:
+    begin = (guess[0] + shift[0], guess[1] + shift[1], guess[2])
+    pixels = region_of_interest(frame, begin, Psf())
+    noise = noise or noise_kind(frame, Psf())
+    return recognise_psf(frame, pixels, begin, (0.8 * radii[0], 1.2 * radii[1]), noise)
+
+
 def noise_kind(frames: Array, psf: Psf) -> NoiseKind:
     """Magnitudes are Rician; a camera's pixels, and signed ones, are not magnitudes."""
     return "gaussian" if psf.folds or frames.min() < 0 else "rician"
@@ -167,6 +185,8 @@ def region_of_interest(
 ) -> Pixels:
     """The pixels within radius + margin of the guess (row, col, radius), clipped at the frame.
 
+    Of a large object only a band inside of the edge: the rest tells nothing of the centre, and
+    shading that no straight line follows would only mislead.
     Raises ObjectAtBorderError where the object itself is not wholly inside of the frame.
     """
     row, col, radius = guess
@@ -179,7 +199,8 @@ def region_of_interest(
         )
     (r0, r1), (c0, c1) = spans
     rows, cols = np.arange(r0, r1, dtype=float), np.arange(c0, c1, dtype=float)
-    mask = np.hypot(rows[:, None] - row, cols[None, :] - col) <= reach
+    distance = np.hypot(rows[:, None] - row, cols[None, :] - col)
+    mask = (distance <= reach) & (distance >= radius - INNER_BAND_PX)
     period = _period((frame.shape[0], frame.shape[1]), reach, psf)
     return Pixels(Patch(rows, cols, period), frame[r0:r1, c0:c1], mask)
 
