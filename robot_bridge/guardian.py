@@ -1,9 +1,9 @@
 """A second process that stops the motors when the daemon cannot: killed, crashed hard, frozen.
 
 It is forked before any port is opened and knows the ports by name. The daemon's loop writes a byte
-into a pipe twenty times a second; when the pipe closes without a farewell, or stays silent, the guardian
-opens the ports itself and sends the stop bytes. It ignores terminal signals and has its own
-session, so what kills the daemon's group by mistake spares it.
+into a pipe twenty times a second; when the pipe closes without a farewell, or stays silent, the
+guardian opens the ports itself and sends the stop bytes. It ignores terminal signals and has its
+own session, so what kills the daemon's group by mistake spares it.
 """
 
 import contextlib
