@@ -1,6 +1,7 @@
 """The serial ports of a robot's controllers: opening, capturing, stopping, closing."""
 
 import contextlib
+import select
 import termios
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -22,17 +23,22 @@ class SerialPort:
     """A device, a pseudo-terminal or any other pyserial URL. Every failure is an OSError."""
 
     def __init__(self, url: str, baud: int) -> None:
-        self._port = serial.serial_for_url(
-            url, baudrate=baud, timeout=READ_WAIT_S, write_timeout=WRITE_WAIT_S
-        )
+        # pyserial's write timeout strikes after a whole write too, when the computer is busy, and
+        # without one it may wait for ever: so it writes what it can, and waiting is done here.
+        self._port = serial.serial_for_url(url, baudrate=baud, timeout=READ_WAIT_S, write_timeout=0)
 
     def read(self, size: int = 1, /) -> bytes:
         data: bytes = self._port.read(size)
         return data
 
     def write(self, data: bytes, /) -> int | None:
-        written: int | None = self._port.write(data)
-        return written
+        left = data
+        while left:
+            _, ready, _ = select.select([], [self._port.fileno()], [], WRITE_WAIT_S)
+            if not ready:
+                raise OSError(f"takes no more bytes, {len(left)} of {len(data)} are left")
+            left = left[self._port.write(left) :]
+        return len(data)
 
     def reset_input_buffer(self) -> None:
         try:

@@ -1,6 +1,8 @@
 """Faults of line, controller, motor and encoder: a typed fault, and all motors stopped."""
 
+import os
 import time
+import tty
 
 import pytest
 from pmd_rig import Rig, axis_config, finish, opened, rig, wait_until
@@ -9,6 +11,7 @@ from robot_bridge.emulator_physics import IdealStage
 from robot_bridge.emulator_switches import Switches
 from robot_bridge.motors import MotorError
 from robot_bridge.pmd401 import PmdMotors
+from robot_bridge.pmd_ports import SerialPort
 
 
 def in_motion(motors: PmdMotors, made: Rig, um: int = 15_000) -> None:
@@ -372,3 +375,16 @@ def test_a_port_that_comes_back_is_opened_again_and_the_position_is_uncertain(tm
                 motors.move_to({"xt": 300, "yt": 0})
                 assert finish(motors).reached
                 assert second.position_um(1) == pytest.approx(300, abs=1)
+
+
+def test_a_port_that_takes_no_bytes_is_an_error_within_its_bound():
+    reader, writer = os.openpty()
+    tty.setraw(writer)
+    port = SerialPort(os.ttyname(writer), 115200)
+    begun_s = time.monotonic()
+    with pytest.raises(OSError, match="takes no more bytes"):
+        port.write(b"X" * 200_000)
+    assert time.monotonic() - begun_s < 0.5
+    port.close()
+    os.close(reader)
+    os.close(writer)
