@@ -9,6 +9,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from room_config.load import Config
+from room_config.service import AccessToken
 from simulator.config import VirtualRoom
 
 HERE = Path(__file__).parent
@@ -63,6 +64,7 @@ def render() -> str:
     for name, field in Config.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
             parts.append(f"\n## `[{name}]`\n\n{_table(field.annotation)}")
+    parts.append(f"\n## `[[service.token]]`\n\n{_table(AccessToken)}")
     parts.append(_BRIDGE)
     parts.append(
         "\n## `[virtual]`\n\nThe virtual room, for `autospine demo` and `autospine scanner`; its keys "

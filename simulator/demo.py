@@ -126,8 +126,10 @@ def _case_folder(case: Path | None) -> Iterator[Path]:
         case.mkdir(parents=True, exist_ok=True)
         yield case
         return
-    with tempfile.TemporaryDirectory(prefix="autospine-demo-") as folder:
-        yield Path(folder)
+    folder = Path(tempfile.mkdtemp(prefix="autospine-demo-"))
+    yield folder
+    # only after a good end: what failed may be gone on with
+    shutil.rmtree(folder, ignore_errors=True)
 
 
 @contextlib.contextmanager

@@ -164,6 +164,7 @@ class DemoRoom:
                 "bridge_link": str(line),
                 "confirm_moves": False,
                 "settle_s": 0.15,
+                "rescan_after_s": 6.0,
             },
             "virtual": {k: v for k, v in self.virtual_table.items() if k != "scanner"},
             "virtual.scanner": self.virtual_table["scanner"],
