@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -105,10 +105,10 @@ class CameraImaging:
     """The benchtop camera over the same stages."""
 
     room: VirtualRoom
-    camera: Camera = Camera()
+    camera: Camera = field(default_factory=Camera)
     frame_s: float = 27.6
     # what comes nearest to the camera's pixel and the interpolation together, and what it misses
-    psf: Psf | None = Psf("gaussian", (0.3,))
+    psf: Psf | None = field(default_factory=lambda: Psf("gaussian", (0.3,)))
     model_sigma_px: float = 0.022
 
     def look(
