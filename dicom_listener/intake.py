@@ -215,7 +215,8 @@ class Intake:
     ) -> tuple[list[NewSlice], list[Slice | None]]:
         try:
             slices = self._read(path, envelope)
-            problems = self._decoder.check(path, slices)
+            usable = [s for s in slices if why_not_usable(s, self._rules.slices) is None]
+            problems = self._decoder.check(path, usable) if usable else {}
         except UnusableError as error:
             reason = _without_path(error.reason, path)
             return [row_without_header(envelope, name, reason)], [None]
