@@ -401,6 +401,17 @@ def reassign(record: CaseRecord, slice_id: int, hold_id: int | None, who: str, w
         record.append_event("slice_reassigned", body, source="operator", who=who)
 
 
+def sync_clock(record: CaseRecord, offset_s: float, uncertainty_s: float, who: str) -> None:
+    """The two clocks were compared now: offset_s is ours minus the scanner's."""
+    body = {"offset_s": offset_s, "uncertainty_s": uncertainty_s, "at_s": time.time()}
+    record.append_event("clock_sync", body, source="operator", who=who)
+
+
+def reset_clock(record: CaseRecord, who: str) -> None:
+    """The scanner's clock was set: forget what was known of it, the next slices show it anew."""
+    record.append_event("clock_reset", {}, source="operator", who=who)
+
+
 def window_of(hold: Hold, confirmed: bool) -> HoldWindow:
     return HoldWindow(
         hold.hold_id,

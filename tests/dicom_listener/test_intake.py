@@ -13,7 +13,7 @@ from pydicom.sequence import Sequence
 from case_record.record import CaseRecord
 from dicom_listener.clock import ClockRules
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope, sha256_of
-from dicom_listener.intake import Intake, IntakeRules
+from dicom_listener.intake import Intake, IntakeRules, sync_clock
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.quirks import ENHANCED_MR_IMAGE
 from dicom_listener.usable import SliceRules
@@ -132,17 +132,13 @@ def test_a_slice_without_any_uid_still_has_a_row(make_desk):
     assert row.sop_instance_uid.startswith("none-")
 
 
-def test_an_explicit_sync_and_a_reset_replace_what_was_known_of_the_clock(make_desk):
+def test_an_explicit_sync_replaces_what_was_known_of_the_clock(make_desk):
     desk = make_desk()
     begin_hold(desk.record, time.time() - 60, expected=9)
     hour_off = mr_data_set("1.2.1", began_s=time.time() - 3600.6)
     assert desk.receive(hour_off)[0].reason_code == "clock_unknown"
-    sync = {"offset_s": 3600.0, "uncertainty_s": 0.5, "at_s": time.time()}
-    desk.record.append_event("clock_sync", sync, source="service", who="anna")
-    desk.intake.look_at_record()
-    other = CaseRecord(desk.record.case_dir)
-    other.append_event("clock_sync", sync, source="service", who="anna")
-    other.close()
+    with CaseRecord(desk.record.case_dir) as service:  # another connection, as in life
+        sync_clock(service, 3600.0, 0.5, "anna")
     desk.intake.look_at_record()
     again = mr_data_set("1.2.2", began_s=time.time() - 3600.6)
     assert desk.receive(again)[0].state == "assigned"

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import pytest
 from listener_room import ListenerProcess, mr_data_set, wait_for, write_room
+from pydicom.uid import ExplicitVRLittleEndian
 from pynetdicom import AE
 
 from case_record.record import CaseRecord
@@ -28,7 +29,7 @@ def send_slices(port: int, first: int, count: int, per_association: int) -> None
     dice = random.Random(first)
     for start in range(first, first + count, per_association):
         ae = AE("SOAK")
-        ae.add_requested_context(MR_IMAGE)
+        ae.add_requested_context(MR_IMAGE, [ExplicitVRLittleEndian])
         association = ae.associate("127.0.0.1", port, ae_title="AUTOSPINE")
         assert association.is_established
         sock = association.dul.socket.socket
