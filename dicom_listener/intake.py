@@ -4,6 +4,7 @@ Runs in the listener's process, one file after the other. A file whose rows are 
 done; any other in the inbox is taken, also one that was received just before a crash.
 """
 
+import sqlite3
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -24,10 +25,10 @@ from dicom_listener.assign import (
     assign,
 )
 from dicom_listener.clock import ClockRules, OffsetBounds, ScannerClock, Sync, observe
+from dicom_listener.decode_guard import DecodeGuard
 from dicom_listener.header import Slice, read_header
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope
 from dicom_listener.metrics import ListenerMetrics
-from dicom_listener.pixels import check_pixels
 from dicom_listener.reasons import Reason, SetAside, UnusableError
 from dicom_listener.slice_rows import (
     outcome_of,
@@ -67,6 +68,7 @@ class Intake:
         self._inbox = inbox
         self._rules = rules
         self._metrics = metrics
+        self._decoder = DecodeGuard()
         self._clocks: dict[str, ScannerClock] = {}
         self._late_scanners: set[str] = set()
         self._known: dict[int, Known] = {}
@@ -76,6 +78,9 @@ class Intake:
         self._seen_event_id = 0
         self._seen_version = -1
         self._remember()
+
+    def close(self) -> None:
+        self._decoder.close()
 
     def _remember(self) -> None:
         """Rebuild from the record what an earlier run of this process knew."""
@@ -99,12 +104,9 @@ class Intake:
 
     # The loop's pieces
 
-    def take_left_over(self) -> int:
-        """Take every inbox file that the record does not have yet; return how many."""
-        files = [path for path in self._inbox.files() if self._named(path) not in self._done]
-        for path in files:
-            self.take(path)
-        return len(files)
+    def left_over(self) -> list[Path]:
+        """Inbox files that the record does not have yet, oldest first."""
+        return [path for path in self._inbox.files() if self._named(path) not in self._done]
 
     def look_at_record(self) -> None:
         """Follow what the other processes wrote: holds, confirmations, syncs, re-assignments."""
@@ -116,7 +118,7 @@ class Intake:
         self._decide_pending()
 
     def take(self, path: Path) -> None:
-        """Record one inbox file. Never raises for what is in the file."""
+        """Record one inbox file. Raises nothing for what is in it, sqlite3.Error for the record."""
         name = self._named(path)
         if name in self._done or not path.exists():
             return
@@ -130,7 +132,15 @@ class Intake:
         if any(row.sha256 == envelope.sha256 for row in before):
             self._drop_duplicate(path, envelope)
             return
-        rows, slices = self._rows_of(path, name, envelope, conflict=bool(before))
+        try:
+            rows, slices = self._rows_of(path, name, envelope, conflict=bool(before))
+        except sqlite3.Error:
+            raise
+        except Exception as error:  # a fault of ours must not stop the slices behind this one
+            log.exception("intake failed", path=name)
+            reason = SetAside(Reason.UNREADABLE, f"internal error: {type(error).__name__}")
+            rows, slices = [row_without_header(envelope, name, reason)], [None]
+            self.alarm("intake_failed", f"{name}: {type(error).__name__}")
         self._write(rows, slices, envelope)
         self._done.add(name)
         self._metrics.intake_seconds.observe(max(0.0, time.time() - envelope.received_s))
@@ -191,7 +201,7 @@ class Intake:
     ) -> tuple[list[NewSlice], list[Slice | None]]:
         try:
             slices = self._read(path, envelope)
-            problems = check_pixels(path, slices)
+            problems = self._decoder.check(path, slices)
         except UnusableError as error:
             reason = _without_path(error.reason, path)
             return [row_without_header(envelope, name, reason)], [None]
@@ -200,7 +210,8 @@ class Intake:
         for slice_ in slices:
             against = self._against(slice_, envelope, problems, conflict)
             decision = against or self._assign(slice_, envelope.received_s, self._known_now(rows))
-            rows.append(row_of(slice_, envelope, name, decision))
+            arrival_mode = self._rules.assign.arrival_mode
+            rows.append(row_of(slice_, envelope, name, decision, arrival_mode=arrival_mode))
         return rows, list(slices)
 
     def _read(self, path: Path, envelope: Envelope) -> list[Slice]:

@@ -17,8 +17,7 @@ class Ask(_Body):
     by: str = Field(default="operator", min_length=1, max_length=64, description=_WHO)
 
 
-Coordinate = float
-PointMm = tuple[Coordinate, Coordinate, Coordinate]
+PointMm = tuple[float, float, float]
 
 
 class PointBody(Ask):

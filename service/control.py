@@ -34,7 +34,15 @@ _LEAST_BETWEEN_STATES_S = 0.02
 _PATIENCE_S = 30.0
 # what may be done while the robot moves; all else waits for standstill and is refused meanwhile
 _WHILE_MOVING = frozenset(
-    {"note_stop", "abort", "describe_case", "assign_slice", "confirm_acquisition", "set_entry"}
+    {
+        "note_stop",
+        "abort",
+        "answer",  # no question is open then: refused as stale
+        "describe_case",
+        "assign_slice",
+        "confirm_acquisition",
+        "set_entry",
+    }
 )
 log = structlog.get_logger()
 

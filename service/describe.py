@@ -10,6 +10,7 @@ import numpy as np
 from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
+from robot_bridge.client import BridgeStatus
 from room_config.load import Config
 from service.alarms import AlarmBook, Condition
 from service.commands import may_start, ready_arrival
@@ -75,7 +76,7 @@ class Describer:
                 "last_outcome": ""
                 if ended is None
                 else _outcome_text(ended.name, ended.state, ended.result),
-                "prompt": execution.prompt or _idle_prompt(record, link, arrival is not None),
+                "prompt": _prompt(record, link, execution, arrival is not None),
                 "ready": arrival is not None,
                 "arrival": None if arrival is None else _arrival(*arrival),
                 "punctured": arrival is not None and _punctured(record, arrival[0]),
@@ -260,10 +261,13 @@ def _error(config: Config, record: CaseRecord, target_mm: list[float] | None) ->
     )
 
 
-def _idle_prompt(record: CaseRecord, link: RoomLink, ready: bool) -> str:
-    status = link.status
-    if status is None:
+def _prompt(record: CaseRecord, link: RoomLink, execution: Execution, ready: bool) -> str:
+    if link.status is None:
         return f"No link to the robot: {link.problem}"
+    return execution.prompt or _idle_prompt(record, link.status, ready)
+
+
+def _idle_prompt(record: CaseRecord, status: BridgeStatus, ready: bool) -> str:
     if ready:
         return "READY: puncture; then say when the needle is out."
     if status.stopped:

@@ -19,8 +19,10 @@ Array = NDArray[np.float64]
 
 DEFAULT_RADII_PX = (2.0, 40.0)
 LEAST_EXPLAINED = 0.45
+SMALL_PX, LEAST_EXPLAINED_SMALL = 3.0, 0.65  # few pixels look like anything: they must fit better
+LARGE_PX = 5.5  # from here on LEAST_EXPLAINED is enough
 LEAST_SIGNIFICANCE = 100.0
-LEAST_COVERAGE = 0.75
+LEAST_COVERAGE = 0.8
 LEAST_SHARPNESS = 0.08  # of the edge's profile, not explained by a straight slope
 LEAST_CONTRAST = 4.0  # of the edge, over the noise of a sector of it
 _OCTAVE_PX = 24.0  # radii above are looked for on a frame of half the size
@@ -123,8 +125,13 @@ def _matches_at_scale(
             m.n_pixels,
         )
         for m in found
-        if m.significance > LEAST_SIGNIFICANCE
+        if m.significance > LEAST_SIGNIFICANCE and m.explained > _least_explained(m.radius_px)
     ]
+
+
+def _least_explained(radius_px: float) -> float:
+    radii, shares = (SMALL_PX, LARGE_PX), (LEAST_EXPLAINED_SMALL, LEAST_EXPLAINED)
+    return float(np.interp(radius_px, radii, shares))
 
 
 def _shrunk(image: Array, scale: int) -> Array:

@@ -19,12 +19,15 @@ from sr_engine.psf import Psf
 from sr_engine.signal import (
     AMPLITUDE,
     BACKGROUND,
-    N_PARAMETERS,
     RADIUS,
     SURROUNDINGS,
+    WALL,
+    WALL_BOUNDS_PX,
+    WALL_PX,
     Mask,
     ObjectModel,
     Pixels,
+    prior_mean,
     prior_precision,
     signal_of,
 )
@@ -33,10 +36,12 @@ Array = NDArray[np.float64]
 
 _OUTLIER_SIGMA = 4.5
 _OUTLIER_NEIGHBOUR_SIGMA = 2.5
-_MAX_ITERATIONS = 60
-_MAX_ROUNDS = 8
+_MAX_ITERATIONS = 40
+_LONGEST_STEP_PX = 0.7  # of centre and radius
+_MAX_ROUNDS = 6
 _SAME_SIGMA = 0.1  # relative change of the noise level that leaves the weights as they are
 _SETTLED = 1e-4  # expected change of chi2, so a step of 0.01 sigma in any parameter
+_NEARLY_SETTLED = 1e-2  # good enough after all iterations: a step of 0.1 sigma
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,8 +77,17 @@ class DiscFit:
         return float(self.parameters[BACKGROUND])
 
     @property
+    def wall_px(self) -> float:
+        """Thickness of the wall; 0 for none."""
+        return float(self.parameters[WALL_PX]) if self.parameters.size > WALL else 0.0
+
+    @property
     def snr(self) -> float:
-        return abs(self.amplitude) / self.sigma
+        """Largest step at the edge, of the object or of its wall, over the noise."""
+        levels = [0.0, self.amplitude]
+        if self.parameters.size > WALL:
+            levels.append(float(self.parameters[WALL]))
+        return float(np.ptp(levels)) / self.sigma
 
     def moved_to(self, centre_px: Array) -> "DiscFit":
         """The same object elsewhere: where to start in the next frame."""
@@ -86,6 +100,7 @@ class _Problem:
     model: ObjectModel
     noise: NoiseKind
     radius_bounds_px: tuple[float, float]
+    whiten: bool
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,19 +130,26 @@ def fit_disc(
     *,
     radius_bounds_px: tuple[float, float],
     shape: Shape = DISC,
+    wall_px: float | None = None,
     noise: NoiseKind = "rician",
     sigma: float | None = None,
     robust: bool = True,
+    whiten: bool = True,
 ) -> DiscFit:
     """Fit the object that starts at (row, col, radius), or like another fit.
 
+    wall_px: expected thickness of a wall (shell) about the object; None for none.
     sigma: noise std per channel where it is known; otherwise it is taken from the residuals.
     robust: leave out pixels that disagree with any round object (a bubble, a neighbour).
+    whiten: allow for the colour that a k-space filter gives the noise; not where the model's own
+      imperfection, and not noise, is what remains.
     Raises NotConvergedError when the fit does not settle or leaves radius_bounds_px.
     """
     begin = start.parameters[:2] if isinstance(start, DiscFit) else np.array(start[:2])
     reference = (float(np.round(begin[0])), float(np.round(begin[1])))
-    problem = _Problem(pixels, ObjectModel(psf, shape, reference), noise, radius_bounds_px)
+    problem = _Problem(
+        pixels, ObjectModel(psf, shape, reference, wall_px), noise, radius_bounds_px, whiten
+    )
     if isinstance(start, DiscFit):
         parameters, level = start.parameters.copy(), start.sigma
     else:
@@ -150,18 +172,25 @@ def fit_disc(
 
 def _linear_start(problem: _Problem, start: tuple[float, float, float]) -> tuple[Array, float]:
     """Parameters with amplitude and background by least squares, and a noise level to begin at."""
-    parameters = np.zeros(N_PARAMETERS)
+    parameters = prior_mean(problem.model)
     parameters[:2] = start[:2]
     parameters[RADIUS] = np.clip(start[2], *problem.radius_bounds_px)
     model, mask = problem.model, problem.pixels.mask
     centre, radius = (start[0], start[1]), float(parameters[RADIUS])
-    s, *_ = unit_object(problem.pixels.patch, model.psf, model.shape, centre, radius)
-    basis = np.stack([s[mask], np.ones(int(mask.sum()))], axis=1)
+    patch = problem.pixels.patch
+    s, *_ = unit_object(patch, model.psf, model.shape, centre, radius)
+    columns = [s[mask], np.ones(int(mask.sum()))]
+    if model.wall_px is not None:
+        outer, *_ = unit_object(patch, model.psf, model.shape, centre, radius + model.wall_px)
+        columns.append((outer - s)[mask])
+    basis = np.stack(columns, axis=1)
     values = problem.pixels.values[mask]
     solution, *_ = np.linalg.lstsq(basis, values, rcond=None)
     if solution[0] == 0:
         raise NotConvergedError("no contrast at the start position")
-    parameters[[AMPLITUDE, BACKGROUND]] = solution
+    parameters[[AMPLITUDE, BACKGROUND]] = solution[:2]
+    if model.wall_px is not None:
+        parameters[WALL] = solution[2]
     misfit = float(1.4826 * np.median(np.abs(values - np.abs(basis @ solution))))
     return parameters, max(misfit, 1e-9 * float(np.ptp(values)))
 
@@ -170,7 +199,7 @@ def _next_sigma(
     problem: _Problem, mask: Mask, at: _Linearised, sigma: float, amplitude: float
 ) -> float:
     values = problem.pixels.values[mask]
-    new = sigma_of(values, at.signal[mask], sigma, problem.noise, N_PARAMETERS)
+    new = sigma_of(values, at.signal[mask], sigma, problem.noise, problem.model.n_parameters)
     return max(new, 1e-9 * amplitude)
 
 
@@ -199,7 +228,7 @@ def _metric(problem: _Problem, signal: Array, sigma: float) -> _Metric:
     mask, psf = problem.pixels.mask, problem.model.psf
     expected = moments(signal[mask], sigma, problem.noise)
     colour = None
-    if not is_white(psf):
+    if problem.whiten and not is_white(psf):
         colour = colour_factor(problem.pixels.patch.period, psf, mask, expected, sigma)
     return _Metric(sigma, 1 / np.sqrt(expected.variance), colour)
 
@@ -221,43 +250,61 @@ def _linearise(problem: _Problem, parameters: Array, metric: _Metric) -> _Linear
     return _Linearised(signal, residual, jacobian, jacobian.T @ jacobian, bend)
 
 
+def _bounds(problem: _Problem) -> tuple[Array, Array]:
+    size = problem.model.n_parameters
+    low, high = np.full(size, -np.inf), np.full(size, np.inf)
+    low[RADIUS], high[RADIUS] = problem.radius_bounds_px
+    low[WALL_PX:], high[WALL_PX:] = WALL_BOUNDS_PX
+    return low, high
+
+
 def _levenberg_marquardt(
     problem: _Problem, parameters: Array, metric: _Metric
 ) -> tuple[Array, _Linearised]:
-    """Minimise chi2 + prior in one metric."""
+    """Minimise chi2 + prior in one metric, within the bounds of radius and wall."""
     damping: float = 1e-3
     at = _linearise(problem, parameters, metric)
-    precision = prior_precision(parameters)
-    low, high = problem.radius_bounds_px
+    mean, precision = prior_mean(problem.model), prior_precision(parameters, problem.model)
+    low, high = _bounds(problem)
     for _ in range(_MAX_ITERATIONS):
-        gradient = at.jacobian.T @ at.residual - precision * parameters
-        cost = float(at.residual @ at.residual + precision @ parameters**2)
-        step = _damped_step(at, precision, gradient, damping)
-        if gradient @ step < _SETTLED * max(1.0, cost / at.residual.size):
-            return parameters + step, at
-        moved = parameters + step
-        moved[RADIUS] = np.clip(moved[RADIUS], low, high)
+        gradient = at.jacobian.T @ at.residual - precision * (parameters - mean)
+        cost = float(at.residual @ at.residual + precision @ (parameters - mean) ** 2)
+        stuck = ((parameters <= low) & (gradient < 0)) | ((parameters >= high) & (gradient > 0))
+        step = _damped_step(at, precision, gradient, damping, ~stuck)
+        moved = np.clip(parameters + step, low, high)
+        gain = float(gradient @ (moved - parameters))
+        if gain < _SETTLED * max(1.0, cost / at.residual.size):
+            return moved, at
         there = _linearise(problem, moved, metric)
-        if there.residual @ there.residual + precision @ moved**2 <= cost * (1 + 1e-12):
+        trial = there.residual @ there.residual + precision @ (moved - mean) ** 2
+        if trial <= cost * (1 + 1e-12):
             parameters, at = moved, there
             damping = max(damping / 30, 1e-9)
         elif damping > 1e8:
             return parameters, at  # no direction improves: as far down as rounding allows
         else:
             damping *= 10
+    if gain < _NEARLY_SETTLED * max(1.0, cost / at.residual.size):
+        return parameters, at
     raise NotConvergedError(f"the fit did not settle in {_MAX_ITERATIONS} iterations")
 
 
-def _damped_step(at: _Linearised, precision: Array, gradient: Array, damping: float) -> Array:
+def _damped_step(
+    at: _Linearised, precision: Array, gradient: Array, damping: float, free: NDArray[np.bool_]
+) -> Array:
     """Newton's step where the Hessian is positive, the Gauss-Newton step elsewhere, damped."""
     gauss_newton = at.information + np.diag(precision)
     damper = np.diag(damping * np.diag(gauss_newton))
-    hessian = gauss_newton + at.bend + damper
+    chosen = np.ix_(free, free)
+    hessian = (gauss_newton + at.bend + damper)[chosen]
     try:
         np.linalg.cholesky(hessian)
     except np.linalg.LinAlgError:
-        hessian = gauss_newton + damper
-    return np.asarray(np.linalg.solve(hessian, gradient))
+        hessian = (gauss_newton + damper)[chosen]
+    step = np.zeros(free.size)
+    step[free] = np.linalg.solve(hessian, gradient[free])
+    # beyond a pixel the linearised edge says nothing: a long step is only its direction
+    return step * min(1.0, _LONGEST_STEP_PX / max(float(np.max(np.abs(step[:AMPLITUDE]))), 1e-12))
 
 
 def _summary(
@@ -279,30 +326,32 @@ def _summary(
     n = at.residual.size
     return DiscFit(
         parameters=parameters,
-        covariance=_covariance(at, parameters),
+        covariance=_covariance(at, parameters, problem.model),
         sigma=sigma,
-        chi2_per_dof=float(at.residual @ at.residual) / max(n - N_PARAMETERS, 1),
+        chi2_per_dof=float(at.residual @ at.residual) / max(n - problem.model.n_parameters, 1),
         n_pixels=n,
         n_masked=int(np.count_nonzero(~problem.pixels.mask)),
         explained=_explained(at, parameters),
     )
 
 
-def _covariance(at: _Linearised, parameters: Array) -> Array:
+def _covariance(at: _Linearised, parameters: Array, model: ObjectModel) -> Array:
     """Mean squared error of the estimate: what the noise does to it, and the pull of the prior.
 
     The pull is judged by the estimate itself, so this is right for an object without shading as
     for one with it, which the inverse of information plus prior is not.
     """
-    precision = prior_precision(parameters)
+    precision = prior_precision(parameters, model)
     inverse = np.linalg.inv(at.information + np.diag(precision))
-    pull = inverse @ (precision * parameters)
+    pull = inverse @ (precision * (parameters - prior_mean(model)))
     return np.asarray(inverse @ at.information @ inverse + np.outer(pull, pull))
 
 
 def _explained(at: _Linearised, parameters: Array) -> float:
     """Growth of chi2 if the object were not there, background and slopes adapting (linearised)."""
     target = at.residual + at.jacobian[:, AMPLITUDE] * parameters[AMPLITUDE]
+    if parameters.size > WALL:
+        target = target + at.jacobian[:, WALL] * parameters[WALL]
     basis, _ = np.linalg.qr(at.jacobian[:, SURROUNDINGS])
     left = target - basis @ (basis.T @ target)
     return float(left @ left - at.residual @ at.residual)

@@ -39,14 +39,16 @@ from sr_engine.signal import Pixels
 Array = NDArray[np.float64]
 
 MARGIN_PX = 4.0  # of surroundings that are fitted with the object
+INNER_BAND_PX = 10.0  # inside of the edge
 SEARCH_PX = 3.0  # how far from a given start the object may be
 DEFAULT_RADII_PX = (1.5, 12.0)
 LEAST_EXPLAINED = 0.3  # of the variance near a given start, by the matched filter
 AMBIGUOUS_RATIO = 0.9  # a second candidate of this share of the best score is as good
 MINIMUM_EXPLAINED = 60.0  # chi2 that an object must take away to be one
 CONSISTENCY_P = 1e-5  # frames that agree look as bad as this once in 100,000 measurements
-MODEL_FLOOR_PX = 0.005  # what an imperfect point spread may do to one frame; check only
+MODEL_FLOOR_PX = 0.01  # what an imperfect point spread may do to one frame; check only
 FOLDING_MARGIN_PX = 6.0
+LARGEST_PERIOD_PX = 160  # ringing that comes round from farther away is below 1e-4 of the object
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,6 +92,7 @@ def localize(
     method: str = "ml",
     psf: Psf | None = None,
     shape: Shape = DISC,
+    wall_px: float | None = None,
     noise: NoiseKind | None = None,
     sigma: float | None = None,
     shift_sigma_px: float = 0.0,
@@ -108,7 +111,9 @@ def localize(
     method: "ml", or one of the paper's, "sr", "bicubic", "base" (see `paper`), which heed
       start_px, radius_px, gate_px and saturation_level alone.
     psf: point spread; default flat k-space. noise: "rician", or "gaussian" (default for a psf
-      that folds, a camera). sigma: noise std per channel where known.
+      that folds, a camera, and where pixels are negative).
+    sigma: noise std per channel, where known.
+    wall_px: expected thickness of a shell about the object, where it has one.
     shift_sigma_px: std per axis of a frame's shift (the motor's repeatability).
     gate_px: refuse an object farther than this from start_px.
     saturation_level: pixel value at which the source saturates, where known.
@@ -130,7 +135,7 @@ def localize(
     radii = checked_radii(radius_px) or DEFAULT_RADII_PX
     start = checked_point(start_px, "start_px")
     psf = psf or Psf()
-    noise = noise or ("gaussian" if psf.folds else "rician")
+    noise = noise or noise_kind(stack, psf)
 
     guess = _first_guess(stack[0], start, shifts[0], radii)
     fits: list[DiscFit] = []
@@ -142,7 +147,7 @@ def localize(
         # the first frame tells the others all but the place
         like = fits[-1].moved_to(np.array(begin[:2])) if fits else begin
         fit = fit_disc(
-            pixels, like, psf, radius_bounds_px=bounds, shape=shape,
+            pixels, like, psf, radius_bounds_px=bounds, shape=shape, wall_px=wall_px,
             noise=noise, sigma=sigma, robust=robust,
         )  # fmt: skip
         _refuse_doubtful(fit, begin, frame.shape)
@@ -153,11 +158,18 @@ def localize(
     return result
 
 
+def noise_kind(frames: Array, psf: Psf) -> NoiseKind:
+    """Magnitudes are Rician; a camera's pixels, and signed ones, are not magnitudes."""
+    return "gaussian" if psf.folds or frames.min() < 0 else "rician"
+
+
 def region_of_interest(
     frame: Array, guess: tuple[float, float, float], psf: Psf, margin_px: float = MARGIN_PX
 ) -> Pixels:
     """The pixels within radius + margin of the guess (row, col, radius), clipped at the frame.
 
+    Of a large object only a band inside of the edge: the rest tells nothing of the centre, and
+    shading that no straight line follows would only mislead.
     Raises ObjectAtBorderError where the object itself is not wholly inside of the frame.
     """
     row, col, radius = guess
@@ -170,12 +182,19 @@ def region_of_interest(
         )
     (r0, r1), (c0, c1) = spans
     rows, cols = np.arange(r0, r1, dtype=float), np.arange(c0, c1, dtype=float)
-    mask = np.hypot(rows[:, None] - row, cols[None, :] - col) <= reach
-    period = (frame.shape[0], frame.shape[1])
-    if psf.folds:  # such a point spread ends after a pixel or two: a small period is as good
-        size = int(np.ceil(2 * (reach + FOLDING_MARGIN_PX)))
-        period = (size, size)
+    distance = np.hypot(rows[:, None] - row, cols[None, :] - col)
+    mask = (distance <= reach) & (distance >= radius - INNER_BAND_PX)
+    period = _period((frame.shape[0], frame.shape[1]), reach, psf)
     return Pixels(Patch(rows, cols, period), frame[r0:r1, c0:c1], mask)
+
+
+def _period(shape: tuple[int, int], reach_px: float, psf: Psf) -> tuple[int, int]:
+    """The frame's own shape, or a smaller one that makes no difference so near the object."""
+    if psf.folds:  # such a point spread ends after a pixel or two
+        size = int(np.ceil(2 * (reach_px + FOLDING_MARGIN_PX)))
+        return size, size
+    enough = max(LARGEST_PERIOD_PX, 2 * int(np.ceil(2 * reach_px)))
+    return min(shape[0], enough), min(shape[1], enough)
 
 
 def refuse_cut_by_border(

@@ -117,7 +117,7 @@ DISC = Shape()
 _RADIUS_STEP = 0.125  # between expansion points; third order then errs by 1e-6 of the peak
 
 
-@lru_cache(maxsize=96)
+@lru_cache(maxsize=192)
 def _expansion(
     period: tuple[int, int], psf: Psf, shape: Shape, radius_px: float
 ) -> tuple[Array, Array, Array, Array]:

@@ -122,4 +122,5 @@ def _profiles(
     inside = (rows >= -0.5) & (cols >= -0.5)
     inside &= (rows <= frame.shape[0] - 0.5) & (cols <= frame.shape[1] - 0.5)
     profiles = sampled.reshape(sectors, -1, distance.size).mean(axis=1)
-    return profiles, distance, inside.reshape(sectors, -1).all(axis=1)
+    complete = np.asarray(inside.reshape(sectors, -1).all(axis=1), dtype=np.bool_)
+    return profiles, distance, complete

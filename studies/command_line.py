@@ -15,6 +15,7 @@ import typer
 app = typer.Typer(no_args_is_help=True, help="Repeat the paper's experiments, ours beside them.")
 
 BAD_INPUT = 2
+PIPE_WIDTH = 120
 
 
 @app.callback()
@@ -171,7 +172,7 @@ def _run_numerical(
     if as_json:
         typer.echo(json.dumps(numerical_report.as_json(study, files), allow_nan=False))
         return
-    console = Console()
+    console = Console() if sys.stdout.isatty() else Console(width=PIPE_WIDTH)
     numerical_report.print_tables(study, console)
     for file in files:
         console.print(f"written: {file}", highlight=False)

@@ -85,7 +85,7 @@ export class Images {
       if (this.state.slice.slice_id !== id) return;
       this.slice.show(geometry, pixels, `Slice ${id}`);
       this.shownSliceId = id;
-      document.documentElement.dataset.sliceShown = id;
+      requestAnimationFrame(() => performance.mark("slice-shown", { detail: id }));
     } catch (error) {
       this.slice.clear(error.message);
     }

@@ -1,5 +1,6 @@
 """The client against the bridge in virtual time, on a clean line."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -12,8 +13,10 @@ from robot_bridge.phases import WorkPhase
 
 
 @pytest.fixture
-def room(tmp_path: Path) -> VirtualRoom:
-    return VirtualRoom(tmp_path, seed=1)
+def room(tmp_path: Path) -> Iterator[VirtualRoom]:
+    room = VirtualRoom(tmp_path, seed=1)
+    yield room
+    room.close()
 
 
 def ready(room: VirtualRoom):

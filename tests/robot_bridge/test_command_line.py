@@ -1,5 +1,7 @@
 """The engineer's commands as processes, to a running daemon and straight at the controllers."""
 
+import contextlib
+import io
 import json
 import subprocess
 import sys
@@ -8,12 +10,24 @@ from pathlib import Path
 import pytest
 from bridge_room import AXES, BridgeRoom, bridge_room, wait_for
 
+from robot_bridge.command_line import main
+
 
 def robot(room: BridgeRoom, *arguments: str, link: bool = True) -> subprocess.CompletedProcess[str]:
     where = ["--link", room.line.far] if link else ["--direct"]
-    command = [sys.executable, "-m", "robot_bridge.command_line"]
-    command += ["--config", str(room.config_file), *where, "--by", "engineer", "--json"]
-    return subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=60)
+    where = ["--config", str(room.config_file), *where, "--by", "engineer", "--json", *arguments]
+    if link:
+        return in_this_process(where)
+    command = [sys.executable, "-m", "robot_bridge.command_line", *where]
+    return subprocess.run(command, capture_output=True, text=True, timeout=60)
+
+
+def in_this_process(arguments: list[str]) -> subprocess.CompletedProcess[str]:
+    """The same `main`, without the second that a new interpreter takes."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = main(arguments)
+    return subprocess.CompletedProcess(arguments, code, out.getvalue(), err.getvalue())
 
 
 def fields(ended: subprocess.CompletedProcess[str]) -> dict:
@@ -136,3 +150,17 @@ def test_without_a_bridge_the_error_is_one_line_and_exit_3(tmp_path: Path):
         assert ended.returncode == 3
         assert "no bridge answers" in ended.stderr
         assert ended.stderr.count("\n") == 1
+
+
+def test_stop_gets_through_while_another_program_has_the_line(tmp_path: Path):
+    with bridge_room(tmp_path) as room:
+        room.start_daemon()
+        client = room.ready_client()
+        ended = robot(room, "--timeout", "0.5", "stop")
+        assert ended.returncode == 3
+        assert "STOP was sent" in ended.stderr
+        client.pump(0.3)  # the other program's session still stands, and sees the stop
+        assert client.status.stopped
+        other = robot(room, "--timeout", "0.5", "status")
+        assert other.returncode == 3
+        assert "cannot be opened" in other.stderr

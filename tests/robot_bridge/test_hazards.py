@@ -349,3 +349,22 @@ def test_a_stalled_axis_fails_the_move_and_latches(tmp_path: Path):
         room.controllers.all[1].faults.stalled = False
         with pytest.raises(RefusedError):
             client.arm("test")
+
+
+def test_h13_stop_gets_through_while_the_control_thread_hangs_on_a_bad_line(tmp_path: Path):
+    """The page's thread calls it; nobody pumps, and half of the frames are lost."""
+    with bridge_room(tmp_path, seed=13) as room:
+        room.start_daemon()
+        client = room.ready_client()
+
+        def hang(state, status) -> None:
+            room.line.set_faults(LineFaults(loss=0.5))
+            threading.Timer(0.1, client.request_stop).start()
+            time.sleep(0.6)
+            moving_after_600_ms.append(room.controllers.moving)
+            room.line.set_faults(LineFaults())
+
+        moving_after_600_ms: list[bool] = []
+        outcome = client.move("a", FAR, None, hang)
+        assert moving_after_600_ms[0] is False
+        assert outcome.code == "operator_stop", outcome
