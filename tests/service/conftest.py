@@ -3,8 +3,8 @@
 from collections.abc import Callable, Iterator
 
 import pytest
+from attended_room import AttendedRoom, running_room
 from offline_arguments import calibration_arguments
-from virtual_room import AttendedRoom, running_room
 
 from service.calibration import Calibration, calibrate
 from service.client import RoomClient

@@ -8,8 +8,8 @@ import time
 import httpx
 import numpy as np
 import pytest
+from attended_room import AttendedRoom, arm, calibrated, wait_for
 from PIL import Image
-from virtual_room import AttendedRoom, arm, calibrated, wait_for
 
 from case_record.record import CaseRecord
 from dicom_listener.pixels import magnitude_pixels

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 import schemathesis
+from attended_room import AttendedRoom, calibrated
 from hypothesis import HealthCheck, given, settings
 from lone_service import running_service
 from schemathesis.checks import not_a_server_error
@@ -16,7 +17,6 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
     unsupported_method,
 )
-from virtual_room import AttendedRoom, calibrated
 
 from service.client import RoomClient
 

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import httpx
 import pytest
+from attended_room import AttendedRoom, arm, calibrated, running_room, wait_for
 from browser import Complaints, running_browser
 from playwright.sync_api import Browser, Page, expect
-from virtual_room import AttendedRoom, arm, calibrated, running_room, wait_for
 
 from service.access import new_token, token_hash
 from service.client import RefusedByServiceError, RoomClient
