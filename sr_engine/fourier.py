@@ -120,7 +120,8 @@ def prepare_filters(
     return _solved(shape, as_key, factor, blur or Blur(), prior or Prior())
 
 
-@lru_cache(maxsize=8)
+# Few: at factor 4 the filters of a large frame take hundreds of megabytes.
+@lru_cache(maxsize=4)
 def _solved(
     shape: tuple[int, int],
     shifts: tuple[tuple[float, float], ...],

@@ -14,6 +14,8 @@ MIN_SIDE_PX = 4
 
 def check_frame(frame: ArrayLike, what: str = "the frame") -> NDArray[np.float64]:
     """One frame (rows, cols) as float64. Raises ShapeError or NotFiniteError."""
+    if np.iscomplexobj(frame):
+        raise ShapeError(f"{what} is complex; magnitude pixels are needed")
     try:
         image = np.asarray(frame, dtype=np.float64)
     except (TypeError, ValueError) as error:

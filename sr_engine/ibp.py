@@ -103,6 +103,7 @@ def estimate_noise_sigma(frames: NDArray[np.float64]) -> float:
 
     A second difference along both axes removes planes and straight axis-parallel edges; the
     median over all pixels ignores the few on the object's edge. Immerkaer, CVIU 64:300 (1996).
+    Too small where a scanner has interpolated, because neighbours then share their noise.
     """
     along_rows = frames[:, :-2] - 2 * frames[:, 1:-1] + frames[:, 2:]
     both = along_rows[:, :, :-2] - 2 * along_rows[:, :, 1:-1] + along_rows[:, :, 2:]

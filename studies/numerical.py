@@ -52,6 +52,11 @@ class StudyPoint:
     methods: tuple[str, ...] = METHODS
 
     @property
+    def frame_count(self) -> int:
+        """Frames that `sr` and `ml` are given."""
+        return 4 if self.shift_set == "paper" else len(shiftset.named(self.shift_set))
+
+    @property
     def hough(self) -> HoughSettings:
         return HoughSettings((self.radius_px / 2, 2 * self.radius_px), self.sensitivity)
 
@@ -118,14 +123,15 @@ def scene_frame(point: StudyPoint, centre_px: Array) -> Array:
 
 
 def _true_centre(point: StudyPoint, number: int, rng: np.random.Generator) -> Array:
-    """In the drawn scene one high-resolution pixel farther to the right each trial, as in the
-    paper; the row's place between pixels is drawn anew, so that nothing hangs on one."""
+    """In the study proper one high-resolution pixel farther to the right each trial, as in the
+    paper; the row's place between pixels is drawn anew, so that nothing hangs on one. In the
+    cells of the map, which have fewer trials, both are drawn."""
     shape = np.array(_frame_shape(point))
     middle = np.floor(shape / 2)
     row_phase, col_phase = rng.uniform(-0.5, 0.5, 2)
-    if point.scene == "drawn":
+    if point.scene == "drawn" and point.index == 0:
         step = 1 / CircleScene(point.radius_px, point.blur_sigma_px).factor
-        # After a frame pixel's worth of steps twice over, start again: the frame is finite.
+        # After a hundred steps start again: the frame is finite.
         col_phase = (number % 100) * step - 1.25
     return np.array([middle[0] + row_phase, middle[1] + col_phase])
 
@@ -139,7 +145,7 @@ def _frame_shape(point: StudyPoint) -> tuple[int, int]:
 def _shifts(point: StudyPoint, rng: np.random.Generator) -> Array:
     """The reference pose is that of the first frame, whatever the set."""
     if point.shift_set == "paper":
-        return shiftset.paper_random(rng).as_array()
+        return shiftset.paper_random(rng, point.frame_count).as_array()
     shifts = shiftset.named(point.shift_set).as_array()
     return np.asarray(shifts - shifts[0])
 

@@ -10,7 +10,7 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
 from studies.numerical import METHODS, SCENES
-from studies.numerical_report import LABELS
+from studies.numerical_report import labels
 from studies.numerical_study import MAP_RADIUS_PX, MAP_SNR, NumericalStudy
 from studies.statistics import errors_px
 
@@ -48,10 +48,10 @@ def draw_scatter(study: NumericalStudy) -> Figure:
     FigureCanvasAgg(figure)
     axes = figure.subplots(2, len(METHODS), squeeze=False)
     shown = [m for m in METHODS if m in study.summaries]
-    limit = 1.05 * max(float(np.abs(errors_px(study.trials, m)).max()) for m in shown)
+    limit = 1.35 * max(float(np.abs(errors_px(study.trials, m)).max()) for m in shown)
     for column, method in enumerate(METHODS):
         above, below = axes[0, column], axes[1, column]
-        above.set_title(LABELS[method], fontsize=11)
+        above.set_title(labels(study)[method], fontsize=11)
         if method in shown:
             _found_against_true(above, study, method)
             _error_cloud(below, study, method, limit)
@@ -64,10 +64,12 @@ def _found_against_true(axes: Axes, study: NumericalStudy, method: str) -> None:
     answered = [t for t in study.trials if method in t.estimates_px]
     true = np.array([t.truth_px[1] for t in answered])
     found = np.array([t.estimates_px[method][1] for t in answered])
-    ends = [true.min(), true.max()]
+    ends = np.array([true.min(), true.max()])
     axes.plot(ends, ends, color="0.6", linewidth=1, zorder=1)
     axes.scatter(true, found, s=10, color=COLOURS[method], zorder=2)
-    axes.set_xlabel("true column, px")
+    # The same section in every panel, whatever went astray.
+    section = (ends[0] - 0.4, ends[1] + 0.4)
+    axes.set(xlim=section, ylim=section, xlabel="true column, px")
     axes.set_aspect("equal")
     axes.grid(alpha=0.25)
 
@@ -105,16 +107,17 @@ def draw_map(study: NumericalStudy) -> Figure:
 
 def _curves(axes: Axes, study: NumericalStudy, scene: str, against: str) -> None:
     fixed, value = ("radius_px", 4.0) if against == "snr" else ("snr", 20.0)
+    named = labels(study)
     ticks = MAP_SNR if against == "snr" else MAP_RADIUS_PX
     cells = [c for c in study.cells if c.point.scene == scene and getattr(c.point, fixed) == value]
     for method in METHODS:
         has = [c for c in cells if method in c.summaries]
         where = [getattr(c.point, against) for c in has]
         means = [c.summaries[method].mean_error_px for c in has]
-        axes.plot(where, means, "o-", color=COLOURS[method], label=LABELS[method], markersize=4)
+        axes.plot(where, means, "o-", color=COLOURS[method], label=named[method], markersize=4)
     where = [getattr(c.point, against) for c in cells]
     bounds = [c.bound_px for c in cells]
-    axes.plot(where, bounds, "--", color="0.45", label="bound, 4 frames")
+    axes.plot(where, bounds, "--", color="0.45", label=f"bound, {study.point.frame_count} frames")
     axes.set(xscale="log", yscale="log")
     axes.set_xticks(ticks, [f"{tick:g}" for tick in ticks])
     axes.minorticks_off()

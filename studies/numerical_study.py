@@ -21,7 +21,7 @@ F_TESTS = (("base", "sr"), ("bicubic", "sr"), ("base", "bicubic"), ("sr", "ml1")
 
 @dataclass(frozen=True)
 class MapPoint:
-    """One cell of the map: its parameters, each method's errors, the bound with four frames."""
+    """One cell of the map: its parameters, each method's errors, the bound with all frames."""
 
     point: StudyPoint
     summaries: dict[str, Summary]
@@ -34,6 +34,12 @@ class MapPoint:
             return None
         return self.summaries["sr"].mean_error_px / self.summaries["ml"].mean_error_px
 
+    def is_ordered(self, worse: str, better: str) -> bool:
+        """Whether both gave answers and ``worse`` has the larger mean error."""
+        if worse not in self.summaries or better not in self.summaries:
+            return False
+        return self.summaries[worse].mean_error_px > self.summaries[better].mean_error_px
+
 
 @dataclass(frozen=True)
 class NumericalStudy:
@@ -45,6 +51,12 @@ class NumericalStudy:
     f_tests: list[FTest]
     bound_px: dict[str, float]
     cells: list[MapPoint]
+
+    def cells_five_times_better(self) -> int:
+        return sum(cell.gain is not None and cell.gain >= 5.0 for cell in self.cells)
+
+    def cells_base_worse_than_sr(self) -> int:
+        return sum(cell.is_ordered("base", "sr") for cell in self.cells)
 
 
 def chosen_parameters(point: StudyPoint) -> dict[str, str]:
@@ -94,12 +106,15 @@ def run_study(
         trials=here,
         summaries=_summaries(here, main.methods),
         f_tests=[test for pair in F_TESTS if (test := f_test(here, *pair)) is not None],
-        bound_px={"ml1": bound_mean_error_px(main, 1), "ml": bound_mean_error_px(main, 4)},
+        bound_px={
+            "ml1": bound_mean_error_px(main, 1),
+            "ml": bound_mean_error_px(main, main.frame_count),
+        },
         cells=[
             MapPoint(
                 where,
                 _summaries(by_index[where.index], where.methods),
-                bound_mean_error_px(where, 4),
+                bound_mean_error_px(where, where.frame_count),
             )
             for where in points[1:]
         ],
