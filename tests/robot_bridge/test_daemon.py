@@ -14,6 +14,7 @@ from bridge_room import AXES, BridgeRoom, bridge_room, wait_for
 from robot_bridge.client import LinkLostError, MoveOutcome, RefusedError
 from robot_bridge.messages import CommandState
 from robot_bridge.phases import WorkPhase
+from simulator.serial_line import LineFaults
 
 FAR = dict.fromkeys(AXES, 14_000)  # about two seconds at full speed
 
@@ -53,6 +54,20 @@ def test_moves_arrive_where_they_were_sent(shared_room: BridgeRoom):
     truth = room.controllers.positions_um()
     assert truth == pytest.approx({"xt": 1000, "yt": -2000, "xb": 500, "yb": 0}, abs=20)
     assert outcome.readback_um == pytest.approx(truth, abs=5)
+
+
+def test_on_a_line_that_loses_a_fifth_of_the_frames_moves_arrive_all_the_same(
+    shared_room: BridgeRoom,
+):
+    room = shared_room
+    client = room.ready_client()
+    room.line.set_faults(LineFaults(loss=0.2, bit_flip=0.02, duplicate=0.05))
+    for number in range(8):
+        setpoints_um = dict.fromkeys(AXES, 200 * (number % 3))
+        outcome = client.move(room.id(f"{number}"), setpoints_um, None)
+        assert outcome.done, outcome
+        assert room.controllers.positions_um() == pytest.approx(setpoints_um, abs=20)
+    assert client.counters.frames_resent > 0
 
 
 def test_stop_during_motion_stands_within_100_ms(shared_room: BridgeRoom):
