@@ -84,6 +84,10 @@ class BridgeClient:
         self._heartbeat_s = heartbeat_s
         self._deadman_s = deadman_s
         self._open_transport = open_transport or (lambda: SerialTransport(url, baud))
+        # STOP goes out even if another program has the line.
+        self._open_for_stop = open_transport or (
+            lambda: SerialTransport(url, baud, exclusive=False)
+        )
         self._clock = clock
         self._pause = pause
         self._end = ServiceEnd()
@@ -296,7 +300,7 @@ class BridgeClient:
         if transport is not None:
             transport.write(encoded)
             return
-        transport = self._open_transport()
+        transport = self._open_for_stop()
         try:
             transport.write(encoded)
         finally:

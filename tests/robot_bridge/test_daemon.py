@@ -259,6 +259,15 @@ def test_without_a_controller_the_daemon_says_which_port_and_exits_3(tmp_path: P
         assert "Traceback" not in room.log
 
 
+def test_a_status_file_that_cannot_be_written_is_named_and_exit_3(tmp_path: Path):
+    extra = f'status_file = "{tmp_path}/room.toml/status.json"'
+    with bridge_room(tmp_path, extra=extra) as room:
+        daemon = room.start_daemon()
+        assert daemon.wait(10) == 3
+        assert "room.toml/status.json: cannot be written" in room.log
+        assert "Traceback" not in room.log
+
+
 def test_a_bad_configuration_is_one_line_and_exit_2(tmp_path: Path):
     file = tmp_path / "room.toml"
     file.write_text('[bridge]\nlink = "/dev/ttyUSB0"\nstate_dir = "s"\ndeadman = 1\n')
