@@ -71,6 +71,7 @@ def intake_rules(config: Config, now_s: float) -> IntakeRules:
         slices=SliceRules(
             coronal_tolerance_deg=config.imaging.coronal_tolerance_deg,
             allow_derived=listener.allow_derived,
+            distortion_corrected=config.imaging.distortion_corrected,
         ),
         assign=AssignRules(
             guard_s=listener.guard_s,

@@ -151,6 +151,7 @@ class DemoRoom:
         line = self.virtual_dir / "line-service"
         tables = {
             "room": {"name": "virtual room", "case_dir": str(self.folder), "virtual": True},
+            "imaging": {"distortion_corrected": False},
             "listener": {
                 "port": dicom_port,
                 # as if the clocks had been compared at the console, to a fiftieth of a second
