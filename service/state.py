@@ -39,6 +39,7 @@ class AcquisitionState(_Frozen):
     request_id: str
     hold_id: int
     count: int
+    slice_position_mm: float | None = None
 
 
 class QuestionState(_Frozen):
