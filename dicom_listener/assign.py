@@ -67,6 +67,11 @@ class Known:
     hold_id: int | None
     code: str = ""
 
+    @property
+    def may_still_count(self) -> bool:
+        """It fills a hold, or may be one that a hold lacks."""
+        return self.hold_id is not None or self.code in _MAY_BE_MISSING
+
 
 @dataclass(frozen=True)
 class Assigned:

@@ -42,6 +42,8 @@ from dicom_listener.usable import SliceRules, why_not_usable
 SOURCE = "listener"
 _HOLDS_LOOKED_AT = 64
 _EVENTS_AT_ONCE = 1000
+_KNOWN_AT_MOST = 1500
+_KNOWN_AFTER_PRUNING = 1000
 
 log = structlog.get_logger("listener")
 
@@ -92,11 +94,23 @@ class Intake:
             self._observe(slice_, row.received_s)
             if row.state == "pending":
                 self._pending[row.slice_id] = slice_
-            if why_not_usable(slice_, self._rules.slices) is None:
-                self._known[row.slice_id] = Known(
-                    slice_, row.received_s, row.hold_id, row.reason_code
-                )
+            self._know(row.slice_id, slice_, row)
         self._read_events(replaying=True)
+
+    def _know(self, slice_id: int, slice_: Slice, row: NewSlice) -> None:
+        """Keep a usable slice for the decisions to come.
+
+        Of those that no decision can rest on any more, the oldest are forgotten.
+        """
+        if why_not_usable(slice_, self._rules.slices) is not None:
+            return
+        self._known[slice_id] = Known(slice_, row.received_s, row.hold_id, row.reason_code)
+        if len(self._known) <= _KNOWN_AT_MOST:
+            return
+        too_many = len(self._known) - _KNOWN_AFTER_PRUNING
+        idle = [id_ for id_, known in self._known.items() if not known.may_still_count]
+        for id_ in idle[:too_many]:
+            del self._known[id_]
 
     @staticmethod
     def _slice_of(row: SliceRow) -> Slice | None:
@@ -201,7 +215,8 @@ class Intake:
     ) -> tuple[list[NewSlice], list[Slice | None]]:
         try:
             slices = self._read(path, envelope)
-            problems = self._decoder.check(path, slices)
+            usable = [s for s in slices if why_not_usable(s, self._rules.slices) is None]
+            problems = self._decoder.check(path, usable) if usable else {}
         except UnusableError as error:
             reason = _without_path(error.reason, path)
             return [row_without_header(envelope, name, reason)], [None]
@@ -271,10 +286,7 @@ class Intake:
                 continue
             if row.state == "pending":
                 self._pending[row.slice_id] = slice_
-            if why_not_usable(slice_, self._rules.slices) is None:
-                self._known[row.slice_id] = Known(
-                    slice_, row.received_s, row.hold_id, row.reason_code
-                )
+            self._know(row.slice_id, slice_, row)
         if any(row.reason_code == Reason.UID_CONFLICT for row in rows):
             self.alarm("same_uid_other_bytes", f"{envelope.sop_instance_uid}: both are kept")
 
@@ -387,6 +399,17 @@ def reassign(record: CaseRecord, slice_id: int, hold_id: int | None, who: str, w
         )
         body = {"slice_id": slice_id, "hold_id": hold_id, "why": why}
         record.append_event("slice_reassigned", body, source="operator", who=who)
+
+
+def sync_clock(record: CaseRecord, offset_s: float, uncertainty_s: float, who: str) -> None:
+    """The two clocks were compared now: offset_s is ours minus the scanner's."""
+    body = {"offset_s": offset_s, "uncertainty_s": uncertainty_s, "at_s": time.time()}
+    record.append_event("clock_sync", body, source="operator", who=who)
+
+
+def reset_clock(record: CaseRecord, who: str) -> None:
+    """The scanner's clock was set: forget what was known of it, the next slices show it anew."""
+    record.append_event("clock_reset", {}, source="operator", who=who)
 
 
 def window_of(hold: Hold, confirmed: bool) -> HoldWindow:

@@ -12,6 +12,7 @@ from service.bodies import (
     Ask,
     AssignmentBody,
     CaseBody,
+    ClockBody,
     HoldBody,
     JogBody,
     PointBody,
@@ -160,6 +161,11 @@ def command_router(loop: ControlLoop) -> APIRouter:
     def needle_out(body: Ask, caller: Caller, key: Key = None) -> None:
         """The needle is out: unlock motion."""
         orders.carry_out(caller, key, "needle_out", body)
+
+    @router.put("/api/v1/clock", tags=["record"], status_code=204, responses=_REFUSALS)
+    def clock(body: ClockBody, caller: Caller, key: Key = None) -> None:
+        """The two clocks were compared: slices are assigned by this from now on."""
+        orders.carry_out(caller, key, "compare_clocks", body)
 
     @router.put("/api/v1/case", tags=["record"], status_code=204, responses=_REFUSALS)
     def case(body: CaseBody, caller: Caller, key: Key = None) -> None:

@@ -45,6 +45,7 @@ class Located:
     chi2_per_dof: float
     strength: float
     psf: Psf
+    method: str = "ml"
 
     @property
     def sigma_px(self) -> Array:

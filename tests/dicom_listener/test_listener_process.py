@@ -21,13 +21,14 @@ from listener_room import (
     wait_for,
     write_room,
 )
+from pydicom.uid import ExplicitVRLittleEndian
 from pynetdicom import AE, evt
 from pynetdicom.association import Association
 
 from case_record.record import CaseRecord
 from dicom_listener.header import read_header
 from dicom_listener.inbox import is_whole, read_envelope
-from dicom_listener.intake import reassign
+from dicom_listener.intake import reassign, reset_clock
 from dicom_listener.pixels import magnitude_pixels
 from dicom_listener.process import run
 from dicom_listener.quirks import MR_IMAGE
@@ -51,7 +52,7 @@ def record(config):
 def send(port: int, *data_sets) -> list[int]:
     """Statuses of a C-STORE of each; -1 where no answer came."""
     ae = AE("SCANNER")
-    ae.add_requested_context(MR_IMAGE)
+    ae.add_requested_context(MR_IMAGE, [ExplicitVRLittleEndian])
     association = ae.associate("127.0.0.1", port, ae_title="AUTOSPINE")
     assert association.is_established
     statuses = [association.send_c_store(d).get("Status", -1) for d in data_sets]
@@ -146,7 +147,7 @@ def test_an_operator_may_overrule_and_who_is_recorded(config, record):
         assert rows(record, 2)[1].reason_code == "not_expected"
 
 
-def test_a_scanner_clock_set_forward_is_an_alarm_and_can_be_reset(config, record):
+def test_a_scanner_clock_set_forward_is_an_alarm(config, record):
     begin_hold(record, time.time() - 100.0, expected=9)
     with listening(config) as listener:
         send(listener.port, mr_data_set("1.2.1", began_s=time.time() - 40.6))
@@ -154,6 +155,20 @@ def test_a_scanner_clock_set_forward_is_an_alarm_and_can_be_reset(config, record
         send(listener.port, mr_data_set("1.2.2", began_s=time.time() - 0.6))
         rows(record, 2)
         wait_for(lambda: alarms(record) == ["clock_jump"])
+
+
+def test_a_scanner_clock_set_back_stops_assignment_until_it_is_reset(tmp_path):
+    config = write_room(tmp_path, late_limit_s=30.0)
+    with CaseRecord(tmp_path / "case", create=True) as record, listening(config) as listener:
+        begin_hold(record, time.time() - 5.0, expected=9)
+        send(listener.port, mr_data_set("1.2.1", began_s=time.time() - 0.6))
+        assert rows(record, 1)[0].state == "assigned"
+        send(listener.port, mr_data_set("1.2.2", began_s=time.time() - 60.6))
+        assert rows(record, 2)[1].reason_code == "late_or_clock_jump"
+        assert alarms(record) == ["late_or_clock_jump"]
+        reset_clock(record, "anna")
+        send(listener.port, mr_data_set("1.2.3", began_s=time.time() - 60.6))
+        assert rows(record, 3)[2].state == "assigned"
 
 
 def test_in_arrival_mode_a_confirmed_acquisition_needs_no_time(tmp_path):
@@ -292,7 +307,7 @@ class Sender(threading.Thread):
 
     def run(self) -> None:
         ae = AE(f"S{self.prefix}"[:16])
-        ae.add_requested_context(MR_IMAGE)
+        ae.add_requested_context(MR_IMAGE, [ExplicitVRLittleEndian])
         ae.dimse_timeout = 2
         opened: list[socket.socket] = []  # pynetdicom leaves it open when the peer dies
         remember = (evt.EVT_CONN_OPEN, lambda event: opened.append(event.assoc.dul.socket.socket))
