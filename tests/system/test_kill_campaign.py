@@ -89,7 +89,7 @@ def campaign(demo, case_dir, seed, kills, punctures, reach_s) -> list[str]:
             victims.append(victim)
         last = demo("--exit", "--punctures", str(punctures), "--seed", "5", case_dir=case_dir)
         ended = last.ended(240.0)
-    assert ended.code == 0, (victims, ended.err)
+    assert ended.code == 0, f"after {victims}: {ended.err[-1500:]}"
     results = ended.results()
     assert len(results["punctures"]) == punctures
     assert all(one["true_error_mm"] <= 0.10 for one in results["punctures"])
