@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 
 _OUTLIER_SIGMA = 4.5
 _OUTLIER_NEIGHBOUR_SIGMA = 2.5
-_MAX_ITERATIONS = 40
+_MAX_ITERATIONS = 120
 _LONGEST_STEP_PX = 0.7  # of centre and radius
 _MAX_ROUNDS = 6
 _SAME_SIGMA = 0.1  # relative change of the noise level that leaves the weights as they are
