@@ -67,6 +67,11 @@ class Known:
     hold_id: int | None
     code: str = ""
 
+    @property
+    def may_still_count(self) -> bool:
+        """It fills a hold, or may be one that a hold lacks."""
+        return self.hold_id is not None or self.code in _MAY_BE_MISSING
+
 
 @dataclass(frozen=True)
 class Assigned:
@@ -117,6 +122,7 @@ def assign(
         or _after_incomplete_hold(slice_, hold, holds, known)
         or _differs_from_set(slice_, hold, holds, known, rules)
         or _twin(slice_, hold, known)
+        or _other_correction(slice_, known)
     )
     if doubt is not None:
         return doubt
@@ -352,6 +358,18 @@ def _twin(slice_: Slice, hold: HoldWindow, known: Sequence[Known]) -> Quarantine
                 "the same acquisition is there with the other distortion correction",
             )
     return None
+
+
+def _other_correction(slice_: Slice, known: Sequence[Known]) -> Quarantined | None:
+    """All slices of a case are distortion-corrected, or none is: the first one used decides."""
+    first = next((k for k in known if k.hold_id is not None), None)
+    if first is None or first.slice.distortion_corrected == slice_.distortion_corrected:
+        return None
+    word = "with" if slice_.distortion_corrected else "without"
+    return Quarantined(
+        Reason.DISTORTION_TWIN,
+        f"{word} distortion correction, unlike the slices used so far in this case",
+    )
 
 
 # 6: count

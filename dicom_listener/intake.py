@@ -4,6 +4,7 @@ Runs in the listener's process, one file after the other. A file whose rows are 
 done; any other in the inbox is taken, also one that was received just before a crash.
 """
 
+import sqlite3
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
@@ -24,10 +25,10 @@ from dicom_listener.assign import (
     assign,
 )
 from dicom_listener.clock import ClockRules, OffsetBounds, ScannerClock, Sync, observe
+from dicom_listener.decode_guard import DecodeGuard
 from dicom_listener.header import Slice, read_header
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope
 from dicom_listener.metrics import ListenerMetrics
-from dicom_listener.pixels import check_pixels
 from dicom_listener.reasons import Reason, SetAside, UnusableError
 from dicom_listener.slice_rows import (
     outcome_of,
@@ -41,6 +42,8 @@ from dicom_listener.usable import SliceRules, why_not_usable
 SOURCE = "listener"
 _HOLDS_LOOKED_AT = 64
 _EVENTS_AT_ONCE = 1000
+_KNOWN_AT_MOST = 1500
+_KNOWN_AFTER_PRUNING = 1000
 
 log = structlog.get_logger("listener")
 
@@ -67,6 +70,7 @@ class Intake:
         self._inbox = inbox
         self._rules = rules
         self._metrics = metrics
+        self._decoder = DecodeGuard()
         self._clocks: dict[str, ScannerClock] = {}
         self._late_scanners: set[str] = set()
         self._known: dict[int, Known] = {}
@@ -76,6 +80,9 @@ class Intake:
         self._seen_event_id = 0
         self._seen_version = -1
         self._remember()
+
+    def close(self) -> None:
+        self._decoder.close()
 
     def _remember(self) -> None:
         """Rebuild from the record what an earlier run of this process knew."""
@@ -87,11 +94,23 @@ class Intake:
             self._observe(slice_, row.received_s)
             if row.state == "pending":
                 self._pending[row.slice_id] = slice_
-            if why_not_usable(slice_, self._rules.slices) is None:
-                self._known[row.slice_id] = Known(
-                    slice_, row.received_s, row.hold_id, row.reason_code
-                )
+            self._know(row.slice_id, slice_, row)
         self._read_events(replaying=True)
+
+    def _know(self, slice_id: int, slice_: Slice, row: NewSlice) -> None:
+        """Keep a usable slice for the decisions to come.
+
+        Of those that no decision can rest on any more, the oldest are forgotten.
+        """
+        if why_not_usable(slice_, self._rules.slices) is not None:
+            return
+        self._known[slice_id] = Known(slice_, row.received_s, row.hold_id, row.reason_code)
+        if len(self._known) <= _KNOWN_AT_MOST:
+            return
+        too_many = len(self._known) - _KNOWN_AFTER_PRUNING
+        idle = [id_ for id_, known in self._known.items() if not known.may_still_count]
+        for id_ in idle[:too_many]:
+            del self._known[id_]
 
     @staticmethod
     def _slice_of(row: SliceRow) -> Slice | None:
@@ -99,12 +118,9 @@ class Intake:
 
     # The loop's pieces
 
-    def take_left_over(self) -> int:
-        """Take every inbox file that the record does not have yet; return how many."""
-        files = [path for path in self._inbox.files() if self._named(path) not in self._done]
-        for path in files:
-            self.take(path)
-        return len(files)
+    def left_over(self) -> list[Path]:
+        """Inbox files that the record does not have yet, oldest first."""
+        return [path for path in self._inbox.files() if self._named(path) not in self._done]
 
     def look_at_record(self) -> None:
         """Follow what the other processes wrote: holds, confirmations, syncs, re-assignments."""
@@ -116,7 +132,7 @@ class Intake:
         self._decide_pending()
 
     def take(self, path: Path) -> None:
-        """Record one inbox file. Never raises for what is in the file."""
+        """Record one inbox file. Raises nothing for what is in it, sqlite3.Error for the record."""
         name = self._named(path)
         if name in self._done or not path.exists():
             return
@@ -130,7 +146,15 @@ class Intake:
         if any(row.sha256 == envelope.sha256 for row in before):
             self._drop_duplicate(path, envelope)
             return
-        rows, slices = self._rows_of(path, name, envelope, conflict=bool(before))
+        try:
+            rows, slices = self._rows_of(path, name, envelope, conflict=bool(before))
+        except sqlite3.Error:
+            raise
+        except Exception as error:  # a fault of ours must not stop the slices behind this one
+            log.exception("intake failed", path=name)
+            reason = SetAside(Reason.UNREADABLE, f"internal error: {type(error).__name__}")
+            rows, slices = [row_without_header(envelope, name, reason)], [None]
+            self.alarm("intake_failed", f"{name}: {type(error).__name__}")
         self._write(rows, slices, envelope)
         self._done.add(name)
         self._metrics.intake_seconds.observe(max(0.0, time.time() - envelope.received_s))
@@ -191,7 +215,8 @@ class Intake:
     ) -> tuple[list[NewSlice], list[Slice | None]]:
         try:
             slices = self._read(path, envelope)
-            problems = check_pixels(path, slices)
+            usable = [s for s in slices if why_not_usable(s, self._rules.slices) is None]
+            problems = self._decoder.check(path, usable) if usable else {}
         except UnusableError as error:
             reason = _without_path(error.reason, path)
             return [row_without_header(envelope, name, reason)], [None]
@@ -200,7 +225,8 @@ class Intake:
         for slice_ in slices:
             against = self._against(slice_, envelope, problems, conflict)
             decision = against or self._assign(slice_, envelope.received_s, self._known_now(rows))
-            rows.append(row_of(slice_, envelope, name, decision))
+            arrival_mode = self._rules.assign.arrival_mode
+            rows.append(row_of(slice_, envelope, name, decision, arrival_mode=arrival_mode))
         return rows, list(slices)
 
     def _read(self, path: Path, envelope: Envelope) -> list[Slice]:
@@ -260,10 +286,7 @@ class Intake:
                 continue
             if row.state == "pending":
                 self._pending[row.slice_id] = slice_
-            if why_not_usable(slice_, self._rules.slices) is None:
-                self._known[row.slice_id] = Known(
-                    slice_, row.received_s, row.hold_id, row.reason_code
-                )
+            self._know(row.slice_id, slice_, row)
         if any(row.reason_code == Reason.UID_CONFLICT for row in rows):
             self.alarm("same_uid_other_bytes", f"{envelope.sop_instance_uid}: both are kept")
 
@@ -376,6 +399,17 @@ def reassign(record: CaseRecord, slice_id: int, hold_id: int | None, who: str, w
         )
         body = {"slice_id": slice_id, "hold_id": hold_id, "why": why}
         record.append_event("slice_reassigned", body, source="operator", who=who)
+
+
+def sync_clock(record: CaseRecord, offset_s: float, uncertainty_s: float, who: str) -> None:
+    """The two clocks were compared now: offset_s is ours minus the scanner's."""
+    body = {"offset_s": offset_s, "uncertainty_s": uncertainty_s, "at_s": time.time()}
+    record.append_event("clock_sync", body, source="operator", who=who)
+
+
+def reset_clock(record: CaseRecord, who: str) -> None:
+    """The scanner's clock was set: forget what was known of it, the next slices show it anew."""
+    record.append_event("clock_reset", {}, source="operator", who=who)
 
 
 def window_of(hold: Hold, confirmed: bool) -> HoldWindow:

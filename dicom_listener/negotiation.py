@@ -105,7 +105,7 @@ def report_of(association: Association, why_rejected: str = "") -> NegotiationRe
     return NegotiationReport(
         calling_ae_title=str(request.calling_ae_title).strip(),
         called_ae_title=str(request.called_ae_title).strip(),
-        peer=f"{association.requestor.address}:{association.requestor.port}",
+        peer=str(association.requestor.address),
         accepted=not why_rejected,
         lines=tuple(lines),
     )

@@ -1,6 +1,7 @@
 """The pixels of one frame as physical magnitudes."""
 
 import warnings
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +23,8 @@ def magnitude_pixels(path: Path, frame: int = 0) -> NDArray[np.float64]:
     and by Philips' private scale; padding becomes 0. Brighter is always larger, never NaN. Real
     and phase images come out as they are: `why_not_usable` tells them from magnitudes.
 
-    Raises UnusableError: no pixels, too few of them, an unknown or damaged encoding, colour.
+    Raises UnusableError: no pixels, too few of them, an unknown or damaged encoding, colour. Some
+    codecs abort the process on damaged data: what comes from outside goes through `decode_guard`.
     """
     return frame_pixels(read_with_pixels(path), frame)
 
@@ -64,7 +66,9 @@ def _stored(data_set: FileDataset, top: Elements, frame: int) -> NDArray[np.inte
         raise UnusableError(Reason.UNREADABLE, f"absurd size: {rows} x {cols} pixels")
     try:
         pixels = pixel_array(data_set, index=frame, raw=True)
-    except Exception as error:  # each codec has exceptions of its own
+    except (KeyboardInterrupt, SystemExit):
+        raise
+    except BaseException as error:  # each codec has its own, and one is no Exception at all
         text = " ".join(str(error).split())[:160] or type(error).__name__
         raise UnusableError(Reason.UNDECODABLE, f"pixels cannot be decoded ({text})") from error
     if pixels.shape != (rows, cols):
@@ -95,7 +99,7 @@ def check_not_blank(pixels: NDArray[np.float64]) -> None:
         raise UnusableError(Reason.BLANK, f"all pixels are {pixels.flat[0]:g}")
 
 
-def check_pixels(path: Path, slices: list[Slice]) -> dict[int, UnusableError]:
+def check_pixels(path: Path, slices: Sequence[Slice]) -> dict[int, UnusableError]:
     """Decode each of the frames once; return what is wrong, by frame index."""
     problems: dict[int, UnusableError] = {}
     data_set = read_with_pixels(path)

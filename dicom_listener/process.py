@@ -1,5 +1,6 @@
 """The listener's process: wires service, inbox, intake and metrics; runs until told to stop."""
 
+import sqlite3
 import threading
 import time
 from collections.abc import Callable
@@ -25,6 +26,7 @@ from room_config.load import Config, ConfigError
 
 _POLL_S = 0.02
 _HOUSEKEEPING_S = 10.0
+_RECORD_RETRY_S = 1.0
 _MIB = 2**20
 
 log = structlog.get_logger("listener")
@@ -69,6 +71,7 @@ def intake_rules(config: Config, now_s: float) -> IntakeRules:
         slices=SliceRules(
             coronal_tolerance_deg=config.imaging.coronal_tolerance_deg,
             allow_derived=listener.allow_derived,
+            distortion_corrected=config.imaging.distortion_corrected,
         ),
         assign=AssignRules(
             guard_s=listener.guard_s,
@@ -128,10 +131,12 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             inbox_folder(config.room.case_dir),
             min_free_bytes=config.listener.min_free_mib * _MIB,
         )
-        discarded = inbox.discard_unfinished()
         intake = Intake(record, inbox, intake_rules(config, time.time()), metrics)
+        stack.callback(intake.close)
         scp = open_scp(config.listener, inbox, metrics, received.put)
         stack.callback(scp.stop)
+        # Only now: who holds the port is the only one to write into this inbox.
+        discarded = inbox.discard_unfinished()
         metrics.show("associations_open", "Open associations", lambda: scp.open_associations)
         metrics.show("inbox_waiting", "Files not yet in the record", received.qsize)
         metrics.show("disk_free_bytes", "Free disk below the inbox", inbox.free_bytes)
@@ -143,8 +148,10 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         on_ready(Ready(scp.port, metrics_port, config.listener.ae_title))
         if discarded:
             intake.alarm("unfinished_files", f"{discarded} unanswered files of an earlier run")
-        left_over = intake.take_left_over()
-        log.info("serving", port=scp.port, left_over=left_over)
+        left_over = intake.left_over()
+        for path in left_over:
+            received.put(path)
+        log.info("serving", port=scp.port, left_over=len(left_over))
         presence = stack.enter_context(Presence(config.room.case_dir, "listener"))
         _loop(intake, scp, inbox, received, stop, presence)
 
@@ -158,19 +165,37 @@ def _loop(
     presence: Presence,
 ) -> None:
     housekeeping_at_s = 0.0
-    is_low = False
+    was_low = False
     while not stop.is_set():
         presence.beat()
-        _take_received(intake, received)
-        intake.look_at_record()
-        while scp.alarms:
-            intake.note_alarm(*scp.alarms.popleft())
-        if time.monotonic() >= housekeeping_at_s:
-            housekeeping_at_s = time.monotonic() + _HOUSEKEEPING_S
-            was_low, is_low = is_low, inbox.free_bytes() < 2 * inbox.min_free_bytes
-            if is_low and not was_low:
-                intake.alarm("disk_low", f"{inbox.free_bytes() // _MIB} MiB free")
-            intake.remove_old(time.time())
+        try:
+            _take_received(intake, received)
+            intake.look_at_record()
+            while scp.alarms:
+                intake.note_alarm(*scp.alarms.popleft())
+            if time.monotonic() >= housekeeping_at_s:
+                housekeeping_at_s = time.monotonic() + _HOUSEKEEPING_S
+                was_low = _housekeep(intake, inbox, was_low)
+        except sqlite3.Error as error:
+            # The slices are safe in the inbox: tried again until the record can be written.
+            log.error("the case record cannot be written", error=str(error))
+            stop.wait(_RECORD_RETRY_S)
+            _requeue(intake, received)
+
+
+def _housekeep(intake: Intake, inbox: Inbox, was_low: bool) -> bool:
+    """Remove what is past its retention; alarm, once, before the disk is so full as to refuse."""
+    free_bytes = inbox.free_bytes()
+    is_low = free_bytes < 2 * inbox.min_free_bytes
+    if is_low and not was_low:
+        intake.alarm("disk_low", f"{free_bytes // _MIB} MiB free")
+    intake.remove_old(time.time())
+    return is_low
+
+
+def _requeue(intake: Intake, received: "SimpleQueue[Path]") -> None:
+    for path in intake.left_over():
+        received.put(path)
 
 
 def _take_received(intake: Intake, received: "SimpleQueue[Path]") -> None:

@@ -5,10 +5,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
+from dicom_listener.decode_guard import DecodeGuard
 from dicom_listener.header import Slice, read_header
 from dicom_listener.pixels import frame_pixels, read_with_pixels
 from dicom_listener.reasons import Reason, UnusableError
 from dicom_listener.usable import BY_HAND, SliceRules, why_not_usable
+
+# JPEG lossless, baseline and extended are decoded by GDCM
+_ABORTING = tuple(f"1.2.840.10008.1.2.4.{number}" for number in (50, 51, 57, 70))
 
 Frame = tuple[Slice, NDArray[np.float64]]
 
@@ -29,10 +33,25 @@ def read_frames(path: Path, rules: SliceRules = BY_HAND) -> list[Frame]:
         first = next(reason for reason in reasons.values() if reason is not None)
         raise UnusableError(first.code, f"{path}: {first.text}")
     try:
+        _check_compressed(path, usable)
         data_set = read_with_pixels(path)
         return [(slice_, frame_pixels(data_set, slice_.frame)) for slice_ in usable]
     except UnusableError as error:
         raise _named(path, error) from error
+
+
+def _check_compressed(path: Path, slices: list[Slice]) -> None:
+    """Try damaged JPEG elsewhere first: its codec would abort this process."""
+    if all(slice_.transfer_syntax_uid not in _ABORTING for slice_ in slices):
+        return
+    guard = DecodeGuard()
+    try:
+        problems = guard.check(path, slices)
+    finally:
+        guard.close()
+    for error in problems.values():
+        if error.reason.code == Reason.UNDECODABLE:
+            raise error
 
 
 def _named(path: Path, error: UnusableError) -> UnusableError:

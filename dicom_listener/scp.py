@@ -33,6 +33,7 @@ DOES_NOT_MATCH_SOP_CLASS = 0xA900
 CANNOT_UNDERSTAND = 0xC000
 _COMMENT_CHARACTERS = 64  # Error Comment (0000,0902) is an LO
 _REPORTS_KEPT = 50
+_SAID_AGAIN_AFTER_S = 60.0
 
 log = structlog.get_logger("listener")
 
@@ -75,6 +76,7 @@ class Scp:
         self._networks = [ipaddress.ip_network(net, strict=False) for net in rules.peer_networks]
         self.reports: deque[NegotiationReport] = deque(maxlen=_REPORTS_KEPT)
         self.alarms: deque[tuple[str, str]] = deque(maxlen=1000)
+        self._said_s: dict[tuple[str, str], float] = {}
         self._ae = self._application_entity()
         self._server: PromptServer = self._ae.make_server(
             (rules.host, rules.port),
@@ -175,7 +177,7 @@ class Scp:
         self._metrics.associations.labels("accepted").inc()
         self.reports.append(report)
         if report.anything_refused:
-            log.warning("presentation contexts refused", report=str(report))
+            self._say("contexts_refused", str(report).replace("\n", "; "))
         event.assoc.dul.socket.message_done()
 
     def _on_rejected(self, event: Event) -> None:
@@ -249,6 +251,16 @@ class Scp:
 
     def _alarm(self, kind: str, text: str) -> None:
         self._metrics.alarms.labels(kind).inc()
+        self._say(kind, text)
+
+    def _say(self, kind: str, text: str) -> None:
+        """Log it, and hand it to the record; the same words again only after a while."""
+        now_s = time.monotonic()
+        if now_s - self._said_s.get((kind, text), -_SAID_AGAIN_AFTER_S) < _SAID_AGAIN_AFTER_S:
+            return
+        if len(self._said_s) > _REPORTS_KEPT:
+            self._said_s.clear()
+        self._said_s[kind, text] = now_s
         self.alarms.append((kind, text))
         log.warning(kind, text=text)
 

@@ -5,7 +5,7 @@ from dataclasses import asdict, fields
 from typing import Any
 
 from case_record.rows import NewSlice
-from dicom_listener.assign import Assigned, Decision, Pending
+from dicom_listener.assign import ARRIVAL, Assigned, Decision, Pending
 from dicom_listener.header import Rescale, Slice
 from dicom_listener.inbox import Envelope
 from dicom_listener.quirks import Kind
@@ -37,11 +37,17 @@ def _geometry(values: Mapping[str, Any]) -> SliceGeometry:
     return SliceGeometry(**{name: tuple(value) for name, value in values.items()})
 
 
-def row_of(slice_: Slice, envelope: Envelope, path: str, decision: Decision | SetAside) -> NewSlice:
-    """The row of one frame, assigned or not."""
+def row_of(
+    slice_: Slice,
+    envelope: Envelope,
+    path: str,
+    decision: Decision | SetAside,
+    *,
+    arrival_mode: bool = False,
+) -> NewSlice:
+    """The row of one frame, assigned or not. In arrival mode every one is marked so."""
     state, hold_id, code, text = outcome_of(decision)
     assigned = decision if isinstance(decision, Assigned) else None
-    interval = slice_.interval
     return NewSlice(
         sop_instance_uid=envelope.sop_instance_uid,
         frame=slice_.frame,
@@ -55,7 +61,7 @@ def row_of(slice_: Slice, envelope: Envelope, path: str, decision: Decision | Se
         received_monotonic_s=envelope.received_monotonic_s,
         acquired_from_s=assigned.acquired_from_s if assigned else None,
         acquired_to_s=assigned.acquired_to_s if assigned else None,
-        time_source=_time_source(decision, interval),
+        time_source=ARRIVAL if arrival_mode else _time_source(decision, slice_.interval),
         header={**header_for_record(slice_), "envelope": asdict(envelope)},
     )
 

@@ -8,6 +8,7 @@ A health check that connects and goes, a peer that says nothing, half a PDU, a T
 never ends: each holds one thread for a bounded time, and their number is bounded too.
 """
 
+import contextlib
 import selectors
 import socket
 import ssl
@@ -72,6 +73,13 @@ class BoundedSocket(AssociationSocket):
                 self._refuse(f"a PDU took longer than {self.pdu_deadline_s:g} s")
         return received
 
+    def _shutdown_socket(self) -> None:
+        """Close in any case. (pynetdicom's own leaves it open where the peer is gone already.)"""
+        if self.socket is not None:
+            with contextlib.suppress(OSError):
+                self.socket.shutdown(socket.SHUT_RDWR)
+            self.socket.close()
+
     def _check_size(self, nr_bytes: int) -> None:
         self.message_bytes += nr_bytes
         if nr_bytes > self.max_pdu_bytes:
@@ -82,6 +90,16 @@ class BoundedSocket(AssociationSocket):
     def _refuse(self, why: str) -> None:
         self.on_refused(why)
         raise OSError(why)
+
+
+class SharedContexts(list[Any]):
+    """Presentation contexts that all associations share: nobody changes them once we serve.
+
+    pynetdicom copies them deeply for every association, which takes longer than all the rest.
+    """
+
+    def __deepcopy__(self, memo: Any) -> "SharedContexts":
+        return self
 
 
 class PromptRequestHandler(RequestHandler):
@@ -112,6 +130,7 @@ class PromptServer(ThreadedAssociationServer):
         self._unopened = threading.BoundedSemaphore(self.most_unopened)
         kwargs["request_handler"] = PromptRequestHandler
         super().__init__(*args, **kwargs)
+        self.contexts: SharedContexts = SharedContexts(self.contexts)
 
     def get_request(self) -> tuple[socket.socket, Any]:
         # No TLS here: a handshake in this thread would let one silent peer stop everyone.

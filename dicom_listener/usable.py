@@ -16,13 +16,17 @@ _NOT_MAGNITUDE = {
 
 @dataclass(frozen=True)
 class SliceRules:
-    """What a room accepts. coronal_tolerance_deg None: any orientation."""
+    """What a room accepts. coronal_tolerance_deg None: any orientation.
+
+    distortion_corrected: None accepts either; within a case they are never mixed (`assign`).
+    """
 
     coronal_tolerance_deg: float | None = 10.0
     allow_real: bool = False
     allow_derived: bool = False
     allow_localizer: bool = False
     need_geometry: bool = True
+    distortion_corrected: bool | None = None
 
 
 #: For files that a person named by hand: any orientation, derived and real images too.
@@ -55,6 +59,10 @@ def _wrong_kind(slice_: Slice, rules: SliceRules) -> SetAside | None:
         return SetAside(Reason.MOSAIC, f"a mosaic of several slices ({image_type})")
     if any(value.upper() == "SCREEN SAVE" for value in slice_.image_type):
         return SetAside(Reason.SCREEN_SAVE, f"a screen save ({image_type})")
+    wanted = rules.distortion_corrected
+    if wanted is not None and slice_.distortion_corrected != wanted:
+        word = "with" if slice_.distortion_corrected else "without"
+        return SetAside(Reason.DISTORTION_TWIN, f"{word} distortion correction ({image_type})")
     if slice_.is_localizer and not rules.allow_localizer:
         title = slice_.series_description or image_type
         return SetAside(Reason.LOCALIZER, f"a localizer ({title})")

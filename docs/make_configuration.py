@@ -9,6 +9,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from room_config.load import Config
+from room_config.service import AccessToken
 from simulator.config import VirtualRoom
 
 HERE = Path(__file__).parent
@@ -39,6 +40,7 @@ the table by itself. Travel limits have no default on purpose.
 | `motion_timeout_s` | 60 | A motion that lasts longer is stopped. |
 | `motion_poll_s` | 0.02 | How often the controllers are asked during a motion. |
 | `controller_baud`, `controller_timeout_s` | 115200, 0.1 | The line to the controllers. |
+| `controller_response_delay_us` | 20 | Their pause before an answer; more behind a fibre converter. |
 | `park_after_move` | false | Park the drives after every move (a powered drive costs SNR). |
 | `guardian` | true | A second process that stops the motors if the daemon is killed. |
 | `capture_file` | none | Every byte to and from the controllers. |
@@ -62,6 +64,7 @@ def render() -> str:
     for name, field in Config.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
             parts.append(f"\n## `[{name}]`\n\n{_table(field.annotation)}")
+    parts.append(f"\n## `[[service.token]]`\n\n{_table(AccessToken)}")
     parts.append(_BRIDGE)
     parts.append(
         "\n## `[virtual]`\n\nThe virtual room, for `autospine demo` and `autospine scanner`; its keys "

@@ -23,6 +23,7 @@ def make_motors(config: BridgeConfig) -> PmdMotors:
         config.axes,
         baud=config.controller_baud,
         timeout_s=config.controller_timeout_s,
+        response_delay_us=config.controller_response_delay_us,
         park_after_move=config.park_after_move,
         capture_file=config.capture_file,
     )

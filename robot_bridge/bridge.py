@@ -389,13 +389,19 @@ class Bridge:
         if self._motion is not None:
             self._follow_motion(self._motion, now_s)
         elif self.motor_status.moving:
-            self.stop_for(Code.MOTOR_FAULT, "an axis moves without a command")
+            self._stop_stray_motion()
         elif self.motor_status.fault is not None and self.armed:
             self.stop_for(Code.MOTOR_FAULT, self.motor_status.fault_text)
         if self.phase is WorkPhase.EMERGENCY and not self.motor_status.parked:
             self._park_again(now_s)
         if self._stop_unconfirmed and now_s - self._stopped_motors_s > STOP_AGAIN_S:
             self._stop_motors()
+
+    def _stop_stray_motion(self) -> None:
+        if self.stopped:
+            self._stop_motors()
+        else:
+            self.stop_for(Code.MOTOR_FAULT, "an axis moves without a command")
 
     def _follow_motion(self, motion: _Motion, now_s: float) -> None:
         status = self.motor_status

@@ -37,6 +37,7 @@ from robot_bridge.transport import SerialTransport, Transport, TransportError
 MOTION_HEARTBEAT_S = 0.05
 STOP_REPEAT_S = 0.02
 HELLO_PAUSE_S = 0.05
+CLOSE_WAIT_S = 1.0
 
 
 class BridgeError(Exception):
@@ -232,8 +233,11 @@ class BridgeClient:
         return self._transport is not None and self._end.session is not None
 
     def close(self) -> None:
-        """Disarm if possible, release the port. Idempotent."""
+        """See a STOP through, disarm if possible, release the port. Idempotent."""
         try:
+            until_s = self._clock() + CLOSE_WAIT_S
+            while self.is_open and self._stopper.pending and self._clock() < until_s:
+                self.pump(STOP_REPEAT_S)
             if self.is_open and self._status is not None and self._status.armed:
                 self._request(messages.Disarm(by=self._name))
         except BridgeError:

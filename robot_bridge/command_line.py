@@ -22,15 +22,25 @@ from pathlib import Path
 from robot_bridge import sessions
 from robot_bridge.__main__ import EXIT_BAD_INPUT, EXIT_COULD_NOT, EXIT_DONE, make_motors
 from robot_bridge.calibrate_steps import CalibrationError, calibrate_steps
-from robot_bridge.client import BridgeClient, BridgeError, BridgeStatus, MoveOutcome, RefusedError
+from robot_bridge.client import (
+    BridgeClient,
+    BridgeError,
+    BridgeStatus,
+    LinkLostError,
+    MoveOutcome,
+    RefusedError,
+)
 from robot_bridge.config import AxisConfig, BridgeConfig, ConfigError, load_bridge_config
+from robot_bridge.framing import encode_stop
 from robot_bridge.journal import JournalError
 from robot_bridge.motors import MotorError
 from robot_bridge.phases import WorkPhase
+from robot_bridge.transport import SerialTransport, TransportError
 
-COULD_NOT = (CalibrationError, JournalError, MotorError, OSError)
+COULD_NOT = (CalibrationError, JournalError, MotorError, OSError, TransportError)
 STATUS_FILE_FRESH_S = 3.0
 STOP_WAIT_S = 5.0
+SHOUTS = 10
 JOG_MAX_MM = 5.0
 STEPS_MAX = 5000
 LONGEST_STEP_UM = 8.0  # the manual's 5 +- 3 um
@@ -188,13 +198,32 @@ def stop(args: argparse.Namespace, config: BridgeConfig) -> None:
         _print(args, {"stopped": True})
         return
     client = _client_on_the_line(args, config)
-    client.request_stop(emergency=args.emergency)  # before anything else, session or not
+    _shout_stop(args.link or str(config.service_link), config.link_baud, args.emergency)
     try:
+        client.request_stop(emergency=args.emergency)
         client.open(args.timeout)
         _await_acknowledgement(client)
         _print(args, _status_fields(client.status))
+    except LinkLostError as error:
+        raise CouldNotError(
+            f"STOP was sent {SHOUTS} times, but nobody could be heard acknowledging it ({error})"
+        ) from error
     finally:
         client.close()
+
+
+def _shout_stop(url: str, baud: int, emergency: bool) -> None:
+    """Before anything else, session or not, and even if another program has the line."""
+    line = SerialTransport(url, baud, exclusive=False)
+    try:
+        frame = encode_stop(secrets.randbits(32), emergency)
+        for _ in range(SHOUTS):
+            line.write(frame)
+            time.sleep(0.01)
+    except TransportError:
+        return  # the client says what is wrong with the line
+    finally:
+        line.close()
 
 
 def _stop_directly(config: BridgeConfig) -> None:

@@ -69,6 +69,7 @@ class BridgeConfig:
     motion_poll_s: float
     controller_baud: int
     controller_timeout_s: float
+    controller_response_delay_us: int
     park_after_move: bool
     guardian: bool
     capture_file: Path | None
@@ -200,6 +201,7 @@ def bridge_config_from_table(table: Mapping[str, Any], where: str) -> BridgeConf
         motion_poll_s=float(keys.number("motion_poll_s", 0.002, 0.1, default=0.02)),
         controller_baud=keys.integer("controller_baud", 9600, 4_000_000, default=115200),
         controller_timeout_s=float(keys.number("controller_timeout_s", 0.005, 2.0, default=0.1)),
+        controller_response_delay_us=keys.integer("controller_response_delay_us", 0, 255, 20),
         park_after_move=keys.boolean("park_after_move", default=False),
         guardian=keys.boolean("guardian", default=True),
         capture_file=Path(capture_file) if capture_file else None,

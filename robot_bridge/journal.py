@@ -79,13 +79,15 @@ class Journal:
         self._sync = sync
         try:
             folder.mkdir(parents=True, exist_ok=True)
+            is_new = not self.path.exists()
             self._fd = os.open(self.path, os.O_RDWR | os.O_CREAT | os.O_APPEND | os.O_CLOEXEC)
         except OSError as error:
             raise JournalError(f"{self.path}: cannot be opened: {error.strerror}") from error
         try:
             self._lock()
             self._load()
-            _sync_folder(folder)
+            if is_new:
+                _sync_folder(folder, sync)
         except BaseException:
             os.close(self._fd)
             raise
@@ -215,9 +217,9 @@ def _end_entry(record: CommandRecord, wall_s: float) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def _sync_folder(folder: Path) -> None:
+def _sync_folder(folder: Path, sync: Callable[[int], None]) -> None:
     descriptor = os.open(folder, os.O_RDONLY | os.O_DIRECTORY)
     try:
-        os.fsync(descriptor)
+        sync(descriptor)
     finally:
         os.close(descriptor)

@@ -7,61 +7,29 @@ drivers, not tried on hardware yet: it says so whenever it starts.
 """
 
 import logging
-import termios
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 
-import serial
-
-from robot_bridge import pmd_protocol
-from robot_bridge.capture import CaptureWriter, CapturingPort
 from robot_bridge.config import AxisConfig
 from robot_bridge.motors import MotorError, MotorStatus
-from robot_bridge.pmd_axis import AxisFaultError, PmdAxis
-from robot_bridge.pmd_line import PmdLine, Port, Procedure, Task
+from robot_bridge.pmd_axis import PmdAxis
+from robot_bridge.pmd_controller import POWER_ON_DELAY_US, AxisFaultError
+from robot_bridge.pmd_line import PmdLine, Procedure, Task
+from robot_bridge.pmd_ports import OpenPort, PmdPorts, SerialPort
 from robot_bridge.pmd_protocol import PmdEchoError, PmdError, PmdTimeoutError
 
 log = logging.getLogger(__name__)
 
 UNTRIED = "PMD401/PMD301 driver: not tried on hardware; do the first-unit checks of bring_up.md"
-READ_WAIT_S = 0.002
 POLL_BUDGET_S = 0.02
 STOP_DEADLINE_S = 0.25
 STOP_ANSWER_TIMEOUT_S = 0.04
 INITIALISE_DEADLINE_S = 10.0
 DECLARE_DEADLINE_S = 2.0
-
+RECONNECT_PAUSE_S = 1.0
 # Faults at rest that mean that a motor may move.
 NEEDS_STOP = frozenset({"damaged_command", "moving_by_itself"})
-
-OpenPort = Callable[[str], Port]
-
-
-class SerialPort:
-    """A device, a pseudo-terminal or any other pyserial URL. Every failure is an OSError."""
-
-    def __init__(self, url: str, baud: int) -> None:
-        self._port = serial.serial_for_url(
-            url, baudrate=baud, timeout=READ_WAIT_S, write_timeout=0.1
-        )
-
-    def read(self, size: int = 1, /) -> bytes:
-        data: bytes = self._port.read(size)
-        return data
-
-    def write(self, data: bytes, /) -> int | None:
-        written: int | None = self._port.write(data)
-        return written
-
-    def reset_input_buffer(self) -> None:
-        try:
-            self._port.reset_input_buffer()
-        except termios.error as error:  # pyserial lets this one through
-            raise OSError(*error.args) from error
-
-    def close(self) -> None:
-        self._port.close()
 
 
 class PmdMotors:
@@ -73,31 +41,38 @@ class PmdMotors:
         *,
         baud: int = 115200,
         timeout_s: float = 0.1,
+        response_delay_us: int = POWER_ON_DELAY_US,
         park_after_move: bool = False,
         capture_file: Path | None = None,
         clock: Callable[[], float] = time.monotonic,
         open_port: OpenPort | None = None,
     ) -> None:
-        self._axes = {config.name: PmdAxis(config, clock) for config in axes}
+        self._axes = {
+            config.name: PmdAxis(config, clock, response_delay_us=response_delay_us)
+            for config in axes
+        }
+        self._ports = PmdPorts(
+            _addresses_by_url(axes),
+            timeout_s=timeout_s,
+            capture_file=capture_file,
+            clock=clock,
+            open_port=open_port or (lambda url: SerialPort(url, baud)),
+        )
         self._timeout_s, self._clock = timeout_s, clock
         self._park_after_move = park_after_move
-        self._capture_file = capture_file
-        self._capture: CaptureWriter | None = None
-        self._open_port = open_port or (lambda url: SerialPort(url, baud))
-        self._lines: dict[str, PmdLine] = {}
-        self._ports: list[Port] = []
         self._motion: dict[str, Task] = {}
-        self._other: dict[str, Task] = {}  # refreshing, parking
+        self._other: dict[str, Task] = {}  # refreshing, parking, confirming a stop
         self._setpoints_um: dict[str, int] = {}
         self._reached = False
-        self._fault: tuple[str, str] | None = None
+        self._fault: tuple[str, str] | None = None  # of the last motion, until the next command
         self._initialised = False
+        self._reconnect_s: float | None = None  # when to try again; set while a port is lost
 
     # Opening and closing
 
     def open(self) -> MotorStatus:
         log.warning(UNTRIED)
-        self._connect()
+        self._ports.connect()
         deadline_s = self._clock() + INITIALISE_DEADLINE_S
         for axis in self._axes.values():
             self._run(axis, axis.initialise(), "initialisation", deadline_s)
@@ -105,58 +80,22 @@ class PmdMotors:
         self._initialised = True
         return self._status()
 
-    def _connect(self) -> None:
-        for axis in self._axes.values():
-            url = axis.config.controller
-            if url in self._lines:
-                continue
-            try:
-                port = self._captured(self._open_port(url), url)
-                # Whatever half line the controllers hold is cancelled.
-                port.write(b"\x1b;")
-            except (OSError, ValueError) as error:
-                raise MotorError("no_port", f"controller port {url}: {error}") from error
-            self._ports.append(port)
-            self._lines[url] = PmdLine(port, self._timeout_s, self._clock)
-
-    def _captured(self, port: Port, url: str) -> Port:
-        if self._capture_file is None:
-            return port
-        if self._capture is None:
-            self._capture = CaptureWriter(self._capture_file)
-        return CapturingPort(port, url, self._capture)
-
     def close(self) -> None:
-        for line in self._lines.values():
-            line.cancel_all()
-        for port in self._ports:
-            port.close()
-        self._lines, self._ports, self._motion, self._other = {}, [], {}, {}
+        self._ports.close()
+        self._motion, self._other = {}, {}
         self._initialised = False
-        if self._capture is not None:
-            self._capture.close()
-            self._capture = None
+        self._reconnect_s = None
 
     def _line_of(self, axis: PmdAxis) -> PmdLine:
-        return self._lines[axis.config.controller]
-
-    def _addresses(self) -> dict[str, list[int]]:
-        by_url: dict[str, list[int]] = {}
-        for axis in self._axes.values():
-            by_url.setdefault(axis.config.controller, []).append(axis.address)
-        return by_url
+        return self._ports.lines[axis.config.controller]
 
     def _run(self, axis: PmdAxis, procedure: Procedure, name: str, deadline_s: float) -> None:
         try:
             self._line_of(axis).run(procedure, f"{name} of axis {axis.config.name}", deadline_s)
         except PmdError as error:
-            raise self._motor_error(axis, error) from error
+            raise MotorError(*_code_and_text(axis, error)) from error
         except OSError as error:
             raise MotorError("port_failed", f"{axis.config.controller}: {error}") from error
-
-    def _motor_error(self, axis: PmdAxis, error: PmdError) -> MotorError:
-        code, text = _code_and_text(axis, error)
-        return MotorError(code, text)
 
     # Beginning something
 
@@ -165,28 +104,23 @@ class PmdMotors:
         axes = {name: self._axis(name) for name in setpoints_um}
         for name, axis in axes.items():
             _check_setpoint(axis.config, setpoints_um[name])
-        self._begin()
-        self._setpoints_um = dict(setpoints_um)
+        for axis in self._axes.values():
+            if axis.fault is not None:
+                raise MotorError(*axis.fault)
+        self._begin(setpoints_um)
         for name, axis in axes.items():
-            procedure = axis.move(setpoints_um[name], self._park_after_move)
-            self._motion[name] = self._line_of(axis).start(procedure, f"move of {name}")
+            self._start(name, axis.move(setpoints_um[name], self._park_after_move), "move")
 
     def home(self) -> None:
         self._require_ready()
-        homes = {name: axis.config.home_um for name, axis in self._axes.items()}
-        for name, home_um in homes.items():
-            if home_um is None:
-                raise MotorError("no_home", f"axis {name}: home_mm is not in the configuration")
-        self._begin()
-        self._setpoints_um = {name: um for name, um in homes.items() if um is not None}
-        for name, home_um in self._setpoints_um.items():
-            axis = self._axes[name]
-            self._motion[name] = self._line_of(axis).start(axis.home(home_um), f"home of {name}")
-
-    def park(self) -> None:
-        self._require_ready()
+        homes_um = {}
         for name, axis in self._axes.items():
-            self._other[name] = self._line_of(axis).start(axis.park(), f"parking of {name}")
+            if axis.config.home_um is None:
+                raise MotorError("no_home", f"axis {name}: home_mm is not in the configuration")
+            homes_um[name] = axis.config.home_um
+        self._begin(homes_um)
+        for name, home_um in homes_um.items():
+            self._start(name, self._axes[name].home(home_um), "home")
 
     def run_steps(self, name: str, steps: int) -> None:
         """Begin an open-loop run of waveform steps, forward positive, of one axis (calibration).
@@ -197,10 +131,14 @@ class PmdMotors:
         self._require_ready()
         axis = self._axis(name)
         _check_run(axis, steps)
-        self._begin()
-        self._setpoints_um = {}
-        procedure = axis.run_steps(steps)
-        self._motion[name] = self._line_of(axis).start(procedure, f"run of {name}")
+        self._begin({})
+        self._start(name, axis.run_steps(steps), "run")
+
+    def park(self) -> None:
+        self._require_ready()
+        self._give_up_tasks()
+        for name, axis in self._axes.items():
+            self._other[name] = self._line_of(axis).start(axis.park(), f"parking of {name}")
 
     def measure_um(self, name: str) -> float:
         """The encoder's position, asked for now. Raises MotorError."""
@@ -217,26 +155,32 @@ class PmdMotors:
         for name, position_um in positions_um.items():
             if not isinstance(position_um, int):
                 raise MotorError("bad_position", f"axis {name}: {position_um!r} um is no integer")
-        self._begin()
+        self._begin({})
         deadline_s = self._clock() + DECLARE_DEADLINE_S
         for name, axis in axes.items():
             self._run(axis, axis.declare(positions_um[name]), "declaration", deadline_s)
 
-    def _begin(self) -> None:
-        """Give up refreshing and parking (the next procedure finds out how far that came)."""
-        for line in self._lines.values():
-            line.cancel_all()
-        self._motion, self._other = {}, {}
+    def _begin(self, setpoints_um: Mapping[str, int]) -> None:
+        self._give_up_tasks()
         self._fault, self._reached = None, False
+        self._setpoints_um = dict(setpoints_um)
+
+    def _start(self, name: str, procedure: Procedure, what: str) -> None:
+        line = self._line_of(self._axes[name])
+        self._motion[name] = line.start(procedure, f"{what} of {name}")
+
+    def _give_up_tasks(self) -> None:
+        """Refreshing and parking; the next procedure finds out how far that came."""
+        self._ports.give_up_tasks()
+        self._motion, self._other = {}, {}
 
     def _require_ready(self) -> None:
         if not self._initialised:
             raise MotorError("not_open", "the controllers are not initialised")
+        if self._reconnect_s is not None:
+            raise MotorError(*(self._fault or ("port_failed", "a controller port is lost")))
         if self._motion:
             raise MotorError("moving", "a motion is under way")
-        for axis in self._axes.values():
-            if axis.fault is not None:
-                raise MotorError(*axis.fault)
 
     def _axis(self, name: str) -> PmdAxis:
         if name not in self._axes:
@@ -250,55 +194,58 @@ class PmdMotors:
             try:
                 self._carry_on()
             except OSError as error:
-                self._fail("port_failed", f"controller port: {error}")
+                self._lose_port(f"controller port: {error}")
         return self._status()
 
     def _carry_on(self) -> None:
+        if self._reconnect_s is not None and not self._ports.lines:
+            self._try_to_reconnect()
+            return
         if not self._motion and not self._other:
-            for name, axis in self._axes.items():
-                task = self._line_of(axis).start(axis.refresh(), f"status of {name}")
-                self._other[name] = task
-        share_s = POLL_BUDGET_S / len(self._lines)
-        for line in self._lines.values():
+            self._for_each_axis(lambda axis: axis.refresh(), "status")
+        share_s = POLL_BUDGET_S / len(self._ports.lines)
+        for line in self._ports.lines.values():
             line.step(share_s)
-        failed_at_rest = self._collect(self._other)
-        failed = self._collect(self._motion)
-        if failed_at_rest and failed_at_rest[0] in NEEDS_STOP:
-            failed = failed_at_rest
-        if failed:
-            self._fail(*failed)
+        failed_at_rest, failed = self._collect(self._other), self._collect(self._motion)
+        if self._reconnect_s is not None:
+            self._finish_reconnecting(failed_at_rest)
+        elif failed or (failed_at_rest and failed_at_rest[0] in NEEDS_STOP):
+            self._fail(*(failed or failed_at_rest or ("", "")))
         elif self._motion and all(task.done for task in self._motion.values()):
             self._motion = {}
             self._reached = self._all_reached()
+
+    def _for_each_axis(self, make: Callable[[PmdAxis], Procedure], what: str) -> None:
+        for name, axis in self._axes.items():
+            self._other[name] = self._line_of(axis).start(make(axis), f"{what} of {name}")
 
     def _collect(self, tasks: dict[str, Task]) -> tuple[str, str] | None:
         """Note the errors of tasks that ended; a motion stays listed until all axes ended."""
         failed = None
         for name, task in list(tasks.items()):
-            if not task.done:
-                continue
-            if task.error is not None:
-                axis = self._axes[name]
-                axis.fault = failed = _code_and_text(axis, task.error)
-                if isinstance(task.error, PmdEchoError):
-                    axis.certain = False
-                log.warning("%s", axis.fault[1])
-            if tasks is self._other:
+            if task.done and task.error is not None:
+                failed = self._note_error(self._axes[name], task.error)
+            if task.done and tasks is self._other:
                 del tasks[name]
+        return failed
+
+    def _note_error(self, axis: PmdAxis, error: PmdError) -> tuple[str, str]:
+        failed = _code_and_text(axis, error)
+        if failed != axis.fault:
+            log.warning("%s", failed[1])
+        axis.fault = failed
+        if isinstance(error, PmdEchoError):
+            axis.certain = False
         return failed
 
     def _fail(self, code: str, text: str) -> None:
         """A fault ends the motion of all axes; the confirmation follows with the next polls."""
         self._fault, self._reached = (code, text), False
         self._motion, self._other = {}, {}
-        for url, addresses in self._addresses().items():
-            try:
-                self._lines[url].write_now(pmd_protocol.emergency_stop_bytes(addresses))
-            except OSError as error:
-                log.error("controller port %s: stop not sent: %s", url, error)
-        for name, axis in self._axes.items():
-            task = self._line_of(axis).start(axis.confirm_stop(), f"stop of {name}")
-            self._other[name] = task
+        if failures := self._ports.send_stop():
+            self._lose_port("; ".join(failures))
+            return
+        self._for_each_axis(lambda axis: axis.confirm_stop(), "stop")
 
     def _all_reached(self) -> bool:
         return all(
@@ -327,39 +274,68 @@ class PmdMotors:
             if axis.park_shift_um is not None and abs(axis.park_shift_um) > axis.config.tolerance_um
         ]
 
+    # A port that goes away and comes back (a plug, a converter)
+
+    def _lose_port(self, text: str) -> None:
+        """Stop what can still be reached, and begin again from opening. Positions are lost."""
+        if self._reconnect_s is None:
+            log.error("%s", text)
+        self._ports.send_stop()
+        self._ports.close()
+        self._motion, self._other = {}, {}
+        self._fault, self._reached = ("port_failed", text), False
+        for axis in self._axes.values():
+            axis.certain = False
+        self._reconnect_s = self._clock() + RECONNECT_PAUSE_S
+
+    def _try_to_reconnect(self) -> None:
+        if self._reconnect_s is None or self._clock() < self._reconnect_s:
+            return
+        self._reconnect_s = self._clock() + RECONNECT_PAUSE_S
+        try:
+            self._ports.connect()
+        except MotorError as error:
+            self._ports.close()
+            self._fault = (error.code, error.text)
+            return
+        self._for_each_axis(lambda axis: axis.initialise(), "initialisation")
+
+    def _finish_reconnecting(self, failed: tuple[str, str] | None) -> None:
+        if failed:
+            self._lose_port(failed[1])
+        elif not self._other:
+            log.warning("the controllers answer again; declare the position, or home")
+            self._fault, self._reconnect_s = None, None
+
     # Stopping
 
     def stop(self) -> None:
         """First the bytes that stop everything, to all buses; then each axis has to confirm."""
-        failures = [] if self._lines else self._connect_for_stop()
-        self._motion, self._other, self._fault, self._reached = {}, {}, None, False
-        for url, addresses in self._addresses().items():
-            if url not in self._lines:
-                continue
+        failures = []
+        if not self._ports.lines:
             try:
-                self._lines[url].write_now(pmd_protocol.emergency_stop_bytes(addresses))
-            except OSError as error:
-                failures.append(f"{url}: {error}")
+                self._ports.connect()
+            except MotorError as error:
+                failures.append(error.text)
+        self._motion, self._other, self._reached = {}, {}, False
+        if self._reconnect_s is None:
+            self._fault = None
+        failures += self._ports.send_stop()
         failures += self._confirm_stops()
+        if self._reconnect_s is not None:
+            self._ports.close()  # initialised again from the start, by `poll`
         if failures:
             raise MotorError("stop_unconfirmed", "; ".join(failures))
 
-    def _connect_for_stop(self) -> list[str]:
-        try:
-            self._connect()
-        except MotorError as error:
-            return [error.text]
-        return []
-
     def _confirm_stops(self) -> list[str]:
         deadline_s = self._clock() + STOP_DEADLINE_S
-        lines = list(self._lines.values())
+        lines = list(self._ports.lines.values())
         for line in lines:
             line.timeout_s = min(self._timeout_s, STOP_ANSWER_TIMEOUT_S)
         tasks = {
-            name: self._line_of(axis).start(self._stop_stubbornly(axis), f"stop of {name}")
+            name: self._line_of(axis).start(_stop_stubbornly(axis), f"stop of {name}")
             for name, axis in self._axes.items()
-            if axis.config.controller in self._lines
+            if axis.config.controller in self._ports.lines
         }
         failures: set[str] = set()
         while not all(t.done for t in tasks.values()) and self._clock() < deadline_s:
@@ -375,14 +351,22 @@ class PmdMotors:
             line.timeout_s = self._timeout_s
         return [*failures, *(f"axis {name} did not confirm the stop" for name in unconfirmed)]
 
-    def _stop_stubbornly(self, axis: PmdAxis) -> Procedure:
-        """Lost answers do not end it; the caller's deadline does."""
-        while True:
-            try:
-                yield from axis.confirm_stop()
-            except PmdTimeoutError:
-                continue
-            return
+
+def _stop_stubbornly(axis: PmdAxis) -> Procedure:
+    """Lost and damaged answers do not end it; the caller's deadline does."""
+    while True:
+        try:
+            yield from axis.confirm_stop()
+        except PmdError:
+            continue
+        return
+
+
+def _addresses_by_url(axes: Sequence[AxisConfig]) -> dict[str, list[int]]:
+    by_url: dict[str, list[int]] = {}
+    for axis in axes:
+        by_url.setdefault(axis.controller, []).append(axis.address)
+    return by_url
 
 
 def _check_setpoint(axis: AxisConfig, setpoint_um: int) -> None:
@@ -414,14 +398,14 @@ def _check_run(axis: PmdAxis, steps: int) -> None:
         )
 
 
+_CODES: dict[type[PmdError], str] = {
+    PmdTimeoutError: "no_answer",
+    PmdEchoError: "damaged_command",
+}
+
+
 def _code_and_text(axis: PmdAxis, error: PmdError) -> tuple[str, str]:
     if isinstance(error, AxisFaultError):
         return error.code, str(error)
     code = next((c for kind, c in _CODES.items() if isinstance(error, kind)), "protocol")
     return code, f"axis {axis.config.name}: {error}"
-
-
-_CODES: dict[type[PmdError], str] = {
-    PmdTimeoutError: "no_answer",
-    PmdEchoError: "damaged_command",
-}

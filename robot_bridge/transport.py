@@ -3,7 +3,6 @@
 import os
 import select
 import socket
-import time
 from typing import Protocol
 
 import serial
@@ -26,15 +25,27 @@ class Transport(Protocol):
 
 
 class SerialTransport:
-    """A device, a pseudo-terminal or `socket://host:port`, opened by pyserial."""
+    """A device, a pseudo-terminal or `socket://host:port`, opened by pyserial.
 
-    def __init__(self, url: str, baud: int, write_timeout_s: float = 0.3) -> None:
+    A device is locked against other programs that lock it too: two readers would each get half of
+    the bytes. `exclusive=False` is for one who only writes (STOP).
+    """
+
+    def __init__(
+        self, url: str, baud: int, *, exclusive: bool = True, write_timeout_s: float = 0.3
+    ) -> None:
         self.url = url
+        is_device = "://" not in url
         try:
             self._serial = serial.serial_for_url(
-                url, baudrate=baud, timeout=0, write_timeout=write_timeout_s
+                url,
+                baudrate=baud,
+                timeout=0,
+                write_timeout=write_timeout_s,
+                exclusive=True if exclusive and is_device else None,
             )
-            self._serial.reset_input_buffer()
+            if exclusive:
+                self._serial.reset_input_buffer()
             if url.startswith("socket://"):
                 # STOP must not wait for a full segment.
                 self._serial._socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -101,14 +112,3 @@ def _reason(error: Exception) -> str:
     if isinstance(error, OSError) and error.errno:
         return os.strerror(error.errno)
     return str(error) or type(error).__name__
-
-
-def open_with_patience(url: str, baud: int, until_s: float) -> SerialTransport:
-    """Try until `until_s` of the monotonic clock. Raises the last TransportError."""
-    while True:
-        try:
-            return SerialTransport(url, baud)
-        except TransportError:
-            if time.monotonic() >= until_s:
-                raise
-            time.sleep(0.05)

@@ -9,6 +9,11 @@ class ImagingConfig(Section):
     coronal_tolerance_deg: float = Field(
         default=10.0, gt=0, le=45, description="Largest angle between slice normal and ±y (LPS)."
     )
+    distortion_corrected: bool | None = Field(
+        default=None,
+        description="Use only slices with (true) or only those without (false) the scanner's "
+        "distortion correction; absent: as the first slice used in a case.",
+    )
     fiducial_radius_min_mm: float = Field(
         default=2.5, gt=0, description="Smallest radius at which the fiducial may appear."
     )

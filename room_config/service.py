@@ -15,7 +15,10 @@ class AccessToken(Section):
     """Somebody who may use the service. `autospine token NAME` makes one."""
 
     name: str = Field(
-        min_length=1, max_length=64, description="Who; this stands in the record with every action."
+        min_length=1,
+        max_length=64,
+        pattern=r"^[^\x00-\x1f\x7f]+$",
+        description="Who; this stands in the record with every action.",
     )
     role: Literal["viewer", "operator"] = Field(
         description="A viewer may look and press STOP; an operator may do everything."

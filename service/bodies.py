@@ -17,8 +17,7 @@ class Ask(_Body):
     by: str = Field(default="operator", min_length=1, max_length=64, description=_WHO)
 
 
-Coordinate = float
-PointMm = tuple[Coordinate, Coordinate, Coordinate]
+PointMm = tuple[float, float, float]
 
 
 class PointBody(Ask):
@@ -62,6 +61,13 @@ class CaseBody(Ask):
     label: str = Field(default="", max_length=200, examples=["Facet joint L4/5 left"])
     operator: str = Field(default="", max_length=200)
     note: str = Field(default="", max_length=2000)
+
+
+class ClockBody(Ask):
+    """A comparison of the two clocks, made now: the room's minus the scanner's."""
+
+    offset_s: float = Field(ge=-86_400 * 366, le=86_400 * 366, examples=[-37.2])
+    uncertainty_s: float = Field(gt=0, le=60, examples=[0.5])
 
 
 class AssignmentBody(Ask):

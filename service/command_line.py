@@ -29,6 +29,9 @@ SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "reconstruct": ("service.reconstruct_files:app", "Super-resolution image from DICOM files."),
     "study": ("studies.command_line:app", "The paper's studies, and ours beside them."),
     "token": ("service.token_command:token", "Make a token for somebody who may use the page."),
+    "replay": ("service.replay:app", "Go through a recorded case, also with another method."),
+    "export": ("service.export:app", "A case as one zip: DICOM, JSON lines, images."),
+    "report": ("service.report:app", "A case as one page: images, table, plots."),
     "check-config": ("service.check_config:app", "Check a room's configuration."),
 }
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -10,6 +11,7 @@ import numpy as np
 from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
+from robot_bridge.client import BridgeStatus
 from room_config.load import Config
 from service.alarms import AlarmBook, Condition
 from service.commands import may_start, ready_arrival
@@ -75,7 +77,7 @@ class Describer:
                 "last_outcome": ""
                 if ended is None
                 else _outcome_text(ended.name, ended.state, ended.result),
-                "prompt": execution.prompt or _idle_prompt(record, link, arrival is not None),
+                "prompt": _prompt(record, link, execution, arrival is not None),
                 "ready": arrival is not None,
                 "arrival": None if arrival is None else _arrival(*arrival),
                 "punctured": arrival is not None and _punctured(record, arrival[0]),
@@ -188,7 +190,6 @@ def _punctured(record: CaseRecord, procedure_id: int) -> bool:
 
 def _measurement(last: Measurement) -> MeasurementState:
     found = last.result or {}
-    radius_px = found.get("radius_px")
     return MeasurementState(
         measurement_id=last.measurement_id,
         method=last.method,
@@ -198,10 +199,8 @@ def _measurement(last: Measurement) -> MeasurementState:
         slice_id=found.get("slice_id"),
         centre_px=found.get("centre_px"),
         sigma_px=found.get("sigma_px"),
-        radius_px=radius_px,
-        radius_mm=None
-        if radius_px is None
-        else radius_px * float(np.mean(found["plane"]["spacing_mm"])),
+        radius_px=found.get("radius_px"),
+        radius_mm=_radius_mm(found) if found else None,
         covariance_mm2=found.get("covariance_mm2"),
         patient_mm=found.get("patient_mm"),
         n_frames=found.get("n_frames", 0),
@@ -230,8 +229,16 @@ def reconstruction_state(record: CaseRecord, measurement: Measurement) -> Recons
     factor = int(shape[0]) // geometry.shape[0]
     fine = geometry.finer_grid(factor)
     return ReconstructionState(
-        measurement_id=measurement.measurement_id, factor=factor, **vars(fine)
+        measurement_id=measurement.measurement_id,
+        factor=factor,
+        patient_mm=result["patient_mm"],
+        radius_mm=_radius_mm(result),
+        **vars(fine),
     )
+
+
+def _radius_mm(result: Mapping[str, Any]) -> float:
+    return float(result["radius_px"]) * float(np.mean(result["plane"]["spacing_mm"]))
 
 
 def _geometry(row: SliceRow) -> SliceGeometry:
@@ -260,10 +267,13 @@ def _error(config: Config, record: CaseRecord, target_mm: list[float] | None) ->
     )
 
 
-def _idle_prompt(record: CaseRecord, link: RoomLink, ready: bool) -> str:
-    status = link.status
-    if status is None:
+def _prompt(record: CaseRecord, link: RoomLink, execution: Execution, ready: bool) -> str:
+    if link.status is None:
         return f"No link to the robot: {link.problem}"
+    return execution.prompt or _idle_prompt(record, link.status, ready)
+
+
+def _idle_prompt(record: CaseRecord, status: BridgeStatus, ready: bool) -> str:
     if ready:
         return "READY: puncture; then say when the needle is out."
     if status.stopped:

@@ -27,6 +27,7 @@ from service.steps import (
     Outcome,
     Step,
 )
+from sr_engine.worker import is_at_position
 
 _SERVICE = "service"
 
@@ -48,6 +49,7 @@ class AcquisitionRequest:
     request_id: str
     hold_id: int
     count: int
+    slice_position_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -196,15 +198,20 @@ class Execution:
         self._let_clocks_agree(hold)
         attempt = 0
         while True:
-            missing = step.count - len(self._record.slices(hold_id=hold.hold_id, state="assigned"))
+            missing = step.count - self._assigned(hold, step.slice_position_mm)
             if missing <= 0:
                 break
+            where = "" if step.slice_position_mm is None else f"@{step.slice_position_mm:.1f}"
             self.request = AcquisitionRequest(
-                f"{hold.hold_id}.{step.count}.{attempt}", hold.hold_id, missing
+                f"{hold.hold_id}.{step.count}{where}.{attempt}",
+                hold.hold_id,
+                missing,
+                step.slice_position_mm,
             )
             again = " again" if attempt else ""
-            self.prompt = f"Acquire {missing} coronal slice{'s' * (missing > 1)}{again}."
-            self._wait_for_slices(hold, missing)
+            at = "" if not where else f" at {step.slice_position_mm:.1f} mm"
+            self.prompt = f"Acquire {missing} coronal slice{'s' * (missing > 1)}{at}{again}."
+            self._wait_for_slices(hold, missing, step.slice_position_mm)
             attempt += 1
         self.request = None
         return Acquired(hold.hold_id, step.count)
@@ -215,14 +222,18 @@ class Execution:
             self.prompt = "Standing still before the next slice."
             self._wait()
 
-    def _wait_for_slices(self, hold: Hold, missing: int) -> None:
+    def _assigned(self, hold: Hold, slice_position_mm: float | None) -> int:
+        rows = self._record.slices(hold_id=hold.hold_id, state="assigned")
+        return sum(is_at_position(row, slice_position_mm) for row in rows)
+
+    def _wait_for_slices(self, hold: Hold, missing: int, slice_position_mm: float | None) -> None:
         """Until the slices are there, or as many came but were set aside, or none for too long."""
         last = self._record.last_slice()
         last_id = last.slice_id if last else 0
-        wanted = len(self._record.slices(hold_id=hold.hold_id, state="assigned")) + missing
+        wanted = self._assigned(hold, slice_position_mm) + missing
         deadline_s = time.monotonic() + self._config.service.rescan_after_s
         while time.monotonic() < deadline_s:
-            assigned = len(self._record.slices(hold_id=hold.hold_id, state="assigned"))
+            assigned = self._assigned(hold, slice_position_mm)
             aside = self._record.count_slices_after(last_id, "quarantined")
             if assigned >= wanted or (aside and assigned + aside >= wanted):
                 return

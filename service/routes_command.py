@@ -12,6 +12,7 @@ from service.bodies import (
     Ask,
     AssignmentBody,
     CaseBody,
+    ClockBody,
     HoldBody,
     JogBody,
     PointBody,
@@ -22,6 +23,7 @@ from service.bodies import (
 from service.control import ControlLoop
 from service.once import Once
 from service.problems import responses
+from service.routes_record import Id
 
 Key = Annotated[
     str | None,
@@ -68,6 +70,9 @@ def who(caller: Identity, claimed: str) -> str:
     return caller.name or claimed
 
 
+_STOP_EXAMPLE = {"by": "Olga", "emergency": False}
+
+
 def stop_router(loop: ControlLoop) -> APIRouter:
     """STOP: handled in the server's own loop, behind no queue, with any body or none."""
     router = APIRouter(tags=["robot"])
@@ -80,7 +85,9 @@ def stop_router(loop: ControlLoop) -> APIRouter:
         openapi_extra={
             "requestBody": {
                 "required": False,
-                "content": {"application/json": {"schema": StopBody.model_json_schema()}},
+                "description": "Optional: `by`, and `emergency` to park the drives as well. "
+                "Whatever cannot be understood does not keep the STOP back.",
+                "content": {"application/json": {"schema": {}, "example": _STOP_EXAMPLE}},
             }
         },
     )
@@ -155,6 +162,11 @@ def command_router(loop: ControlLoop) -> APIRouter:
         """The needle is out: unlock motion."""
         orders.carry_out(caller, key, "needle_out", body)
 
+    @router.put("/api/v1/clock", tags=["record"], status_code=204, responses=_REFUSALS)
+    def clock(body: ClockBody, caller: Caller, key: Key = None) -> None:
+        """The two clocks were compared: slices are assigned by this from now on."""
+        orders.carry_out(caller, key, "compare_clocks", body)
+
     @router.put("/api/v1/case", tags=["record"], status_code=204, responses=_REFUSALS)
     def case(body: CaseBody, caller: Caller, key: Key = None) -> None:
         """Write down what the case is called, who operates, and a note."""
@@ -166,7 +178,7 @@ def command_router(loop: ControlLoop) -> APIRouter:
         status_code=204,
         responses=_WITH_ID,
     )
-    def assignment(slice_id: int, body: AssignmentBody, caller: Caller, key: Key = None) -> None:
+    def assignment(slice_id: Id, body: AssignmentBody, caller: Caller, key: Key = None) -> None:
         """Overrule the listener about one slice."""
         orders.carry_out(caller, key, "assign_slice", body, slice_id=slice_id)
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Header, Query, Request, Response
+from fastapi import Path as PathParameter
 from fastapi.responses import StreamingResponse
 from numpy.typing import NDArray
 
@@ -28,8 +29,8 @@ from service.past import past_cases, targets_over_time
 from service.problems import responses
 from service.state import RoomState
 
-Open = Callable[[], CaseRecord]
 _MOST_ID = 2**53
+Id = Annotated[int, PathParameter(ge=1, le=_MOST_ID)]
 After = Annotated[
     int, Query(ge=0, le=_MOST_ID, description="Begin after this id (before it with `newest`).")
 ]
@@ -135,7 +136,7 @@ def record_router(case_dir: Path) -> APIRouter:
         return [_slice_body(row) for row in rows]
 
     @router.get("/api/v1/slices/{slice_id}", responses=_WITH_ID)
-    def one_slice(slice_id: int) -> SliceBody:
+    def one_slice(slice_id: Id) -> SliceBody:
         """One slice."""
         with CaseRecord(case_dir) as record:
             return _slice_body(record.slice(slice_id))
@@ -185,7 +186,7 @@ def image_router(case_dir: Path) -> APIRouter:
         responses=_image_responses(_PNG),
     )
     def slice_image(
-        slice_id: int,
+        slice_id: Id,
         window: Window = None,
         level: Level = None,
         scale: Scale = 1,
@@ -204,7 +205,7 @@ def image_router(case_dir: Path) -> APIRouter:
         response_class=Response,
         responses=_image_responses(_RAW),
     )
-    def raw_slice(slice_id: int, match: Match = None) -> Response:
+    def raw_slice(slice_id: Id, match: Match = None) -> Response:
         """The magnitudes, row by row, little-endian 32-bit floats; `X-Shape: rows,cols`."""
         with CaseRecord(case_dir) as record:
             key = f"raw {record.slice(slice_id).sha256} {slice_id}"
@@ -217,7 +218,7 @@ def image_router(case_dir: Path) -> APIRouter:
         response_class=Response,
         responses=_image_responses(_DICOM),
     )
-    def dicom_file(slice_id: int, match: Match = None) -> Response:
+    def dicom_file(slice_id: Id, match: Match = None) -> Response:
         """The DICOM file, bit for bit as it was received."""
         with CaseRecord(case_dir) as record:
             path = slice_file(record, slice_id)
@@ -231,7 +232,7 @@ def image_router(case_dir: Path) -> APIRouter:
         responses=_image_responses(_PNG),
     )
     def measurement_image(
-        measurement_id: int,
+        measurement_id: Id,
         window: Window = None,
         level: Level = None,
         scale: Scale = 1,
@@ -249,7 +250,7 @@ def image_router(case_dir: Path) -> APIRouter:
         response_class=Response,
         responses=_image_responses(_RAW),
     )
-    def raw_measurement(measurement_id: int, match: Match = None) -> Response:
+    def raw_measurement(measurement_id: Id, match: Match = None) -> Response:
         """The reconstruction as little-endian 32-bit floats; `X-Shape: rows,cols`."""
         with CaseRecord(case_dir) as record:
             pixels = reconstruction_pixels(record, measurement_id)

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
+from dataclasses import MISSING, fields
 from typing import TypeVar
 
 from case_record.record import CaseRecord
+from case_record.rows import Step as RecordedStep
 from service.steps import (
     Outcome,
     ProcedureSteps,
@@ -56,6 +58,14 @@ def run_procedure(
         procedure.close()
 
 
+def same_step(known: RecordedStep, step: Step) -> bool:
+    """True if the recorded step is this one; what a program before did not know has its default."""
+    kind, body = step_to_json(step)
+    defaults = {one.name: one.default for one in fields(step) if one.default is not MISSING}
+    recorded = json.loads(json.dumps({**defaults, **known.body}))
+    return known.kind == kind and recorded == json.loads(json.dumps(body))
+
+
 def _carry_out(
     record: CaseRecord,
     procedure_id: int,
@@ -66,7 +76,7 @@ def _carry_out(
 ) -> Outcome:
     kind, body = step_to_json(step)
     known = record.send_step(procedure_id, number, kind, body)
-    if (known.kind, known.body) != (kind, json.loads(json.dumps(body))):
+    if not same_step(known, step):
         raise ReplayMismatchError(
             f"step {number} of procedure {procedure_id} is recorded as {known.kind}, this program "
             f"would take another one ({kind}); the procedure must be started anew"

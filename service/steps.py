@@ -34,10 +34,13 @@ class Acquire:
     """Wait until `count` slices in all were acquired at the present hold.
 
     fresh: begin a new hold here first, without any motion, so that earlier slices do not count.
+    slice_position_mm: where along the slice normal; None where the protocol has it. Slices at
+    other positions do not count.
     """
 
     count: int
     fresh: bool = False
+    slice_position_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -54,6 +57,7 @@ class Measure:
 
     expected_plane_mm and gate_mm: where it must be (image plane), None when nothing is known.
     shift_sigma_mm: how far a hold may be from its shift, per axis (standard deviation).
+    slice_position_mm: only slices at this place along their normal; None: all.
     """
 
     holds: tuple[HoldShift, ...]
@@ -61,6 +65,7 @@ class Measure:
     expected_plane_mm: tuple[float, float] | None = None
     gate_mm: float | None = None
     shift_sigma_mm: float = 0.0
+    slice_position_mm: float | None = None
 
 
 @dataclass(frozen=True)

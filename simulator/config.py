@@ -197,7 +197,7 @@ class ScannerSettings(_Table):
     """How often the operator looks at what to acquire."""
     retry_s: Positive = 0.5
     """From a failed delivery until the next attempt."""
-    retries: Annotated[int, Field(ge=0)] = 20
+    retries: Annotated[int, Field(ge=0)] = 120
     """Attempts after the first."""
     clock_offset_s: float = 37.2
     """The scanner's clock minus ours."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import shutil
 import signal
 import sys
 import tempfile
@@ -25,7 +26,7 @@ from simulator.demo_screen import DemoScreen, final_table
 from simulator.truth_client import TruthAddress
 from simulator.unintended import ask_motions, unintended_motions
 
-BAD_INPUT, COULD_NOT = 2, 3
+BAD_INPUT, COULD_NOT, INTERRUPTED = 2, 3, 130
 app = typer.Typer(add_completion=False)
 
 
@@ -56,9 +57,15 @@ def demo(
                 f"autospine: no fault {name!r}; known: {', '.join(known_faults())}", file=sys.stderr
             )
             return BAD_INPUT
-    with _case_folder(case) as folder, _signals():
+    folder = case or Path(tempfile.mkdtemp(prefix="autospine-demo-"))
+    folder.mkdir(parents=True, exist_ok=True)
+    code = INTERRUPTED
+    with _signals():
         options = DemoOptions(folder, seed, tuple(fault or ()), page_port, dicom_port)
-        return _run(DemoRoom(options), punctures, leave=exit_, as_json=json_)
+        code = _run(DemoRoom(options), punctures, leave=exit_, as_json=json_)
+    if case is None and code != COULD_NOT:
+        shutil.rmtree(folder, ignore_errors=True)  # what failed may be gone on with
+    return code
 
 
 def _run(room: DemoRoom, punctures: int, *, leave: bool, as_json: bool) -> int:
@@ -84,7 +91,7 @@ def _run(room: DemoRoom, punctures: int, *, leave: bool, as_json: bool) -> int:
         return 0
     except _Ended:
         screen.note("ending")
-        return 0 if operator is not None and len(operator.results) >= punctures else 130
+        return 0 if operator is not None and len(operator.results) >= punctures else INTERRUPTED
     except (ChildError, DemoFailedError) as error:
         _stand_still(room, operator, screen)
         print(f"autospine: {error}", file=sys.stderr)
@@ -118,16 +125,6 @@ def _wait_until_ended(room: DemoRoom) -> None:
     while True:
         room.check()
         threading.Event().wait(0.2)
-
-
-@contextlib.contextmanager
-def _case_folder(case: Path | None) -> Iterator[Path]:
-    if case is not None:
-        case.mkdir(parents=True, exist_ok=True)
-        yield case
-        return
-    with tempfile.TemporaryDirectory(prefix="autospine-demo-") as folder:
-        yield Path(folder)
 
 
 @contextlib.contextmanager

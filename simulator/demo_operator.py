@@ -25,6 +25,8 @@ _POLL_S = 0.05
 _PATIENCE_S = 90.0
 _MOST_FAILURES = 4
 _TARGET_REACH_MM = 7.0
+_ASKED_IN_VAIN = 4
+_CLOCK_READING_S = 0.02
 
 
 class DemoFailedError(Exception):
@@ -61,6 +63,8 @@ class Operator:
         self._truth = truth
         self._results_file = results_file
         self._seed = seed
+        self._console = results_file.with_name("acquisitions.jsonl")
+        self._compared_at = ""
         self._failures = 0
         self._failed_id: int | None = None
         self._changed_s = time.monotonic()
@@ -106,7 +110,7 @@ class Operator:
         elif state["question"] is not None:
             self._answer(state["question"])
         elif state["procedure"] is not None:
-            return True
+            self._compare_clocks_if_slices_are_refused(state["acquisition_request"])
         elif state["ready"]:
             self._puncture(state)
         elif len(self.results) >= punctures:
@@ -119,6 +123,23 @@ class Operator:
             self._set_target(state)
             self._post("/api/v1/approach")
         return True
+
+    def _compare_clocks_if_slices_are_refused(self, request: dict[str, Any] | None) -> None:
+        """Slices asked for again and again: look whether the scanner's clock was set."""
+        if request is None or request["request_id"] == self._compared_at:
+            return
+        if int(request["request_id"].rsplit(".", 1)[1]) % _ASKED_IN_VAIN != _ASKED_IN_VAIN - 1:
+            return
+        self._compared_at = request["request_id"]
+        last = next((s for s in reversed(self._scans()) if s.get("kind") == "acquisition"), None)
+        if last is not None:
+            offset_s = last["started_s"] - last["scanner_clock_s"]
+            self._put("/api/v1/clock", offset_s=offset_s, uncertainty_s=_CLOCK_READING_S)
+
+    def _scans(self) -> list[dict[str, Any]]:
+        """What the scanner's console shows of its acquisitions."""
+        lines = self._console.read_text().splitlines() if self._console.exists() else []
+        return [json.loads(line) for line in lines]
 
     def _answer(self, question: dict[str, Any]) -> None:
         choice = next(

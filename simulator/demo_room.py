@@ -151,6 +151,7 @@ class DemoRoom:
         line = self.virtual_dir / "line-service"
         tables = {
             "room": {"name": "virtual room", "case_dir": str(self.folder), "virtual": True},
+            "imaging": {"distortion_corrected": False},
             "listener": {
                 "port": dicom_port,
                 # as if the clocks had been compared at the console, to a fiftieth of a second
@@ -164,6 +165,7 @@ class DemoRoom:
                 "bridge_link": str(line),
                 "confirm_moves": False,
                 "settle_s": 0.15,
+                "rescan_after_s": 6.0,
             },
             "virtual": {k: v for k, v in self.virtual_table.items() if k != "scanner"},
             "virtual.scanner": self.virtual_table["scanner"],

@@ -157,8 +157,16 @@ class VirtualScanner:
         if "corrupted" in scan.faults:
             corrupt(dataset, self._centre_px(scan), self._dice)
         self._record(scan, series, dataset)
-        if "extra_series" in scan.faults:
-            self._send_extra_series(scan, ready_s)
+        extras = self._extra_images(scan) if "extra_series" in scan.faults else []
+        # Vendors send them before or after the slice itself.
+        after = int(self._dice.integers(0, len(extras) + 1))
+        for extra in extras[:after]:
+            self._outbox.push(extra, ready_s)
+        self._push(scan, dataset, ready_s)
+        for extra in extras[after:]:
+            self._outbox.push(extra, ready_s)
+
+    def _push(self, scan: Scan, dataset: Dataset, ready_s: float) -> None:
         if "missing" in scan.faults:
             pass
         elif "out_of_order" in scan.faults:
@@ -177,20 +185,24 @@ class VirtualScanner:
             self._outbox.push(dataset, after_s + 1e-3)
         self._held_back.clear()
 
-    def _send_extra_series(self, scan: Scan, due_s: float) -> None:
+    def _extra_images(self, scan: Scan) -> list[Dataset]:
         """What vendors send along without being asked."""
         localizer_room = self._room.model_copy(update={"protocol": _localizer_protocol(self._room)})
         planes = self._new_series("localizer", ("M", "ND", "LOCALIZER"))
+        images = []
         for index, plane in enumerate(("coronal", "axial", "sagittal")):
             seen = acquire(localizer_room, scan.slice.stage_mm, self._noise, orientation=plane)
             extra = Scan(scan.request, index, scan.started_s, scan.ended_s, seen, scan.faults)
-            image = self._image(extra, planes, seen.magnitude, localizer_room)
-            self._outbox.push(image, due_s)
+            images.append(self._image(extra, planes, seen.magnitude, localizer_room))
         phase = self._new_series("fl2d_cor_guide", ("P", "ND"))
-        self._outbox.push(self._image(scan, phase, phase_of(scan.slice.signal)), due_s)
+        images.append(self._image(scan, phase, phase_of(scan.slice.signal)))
         twin = self._new_series("fl2d_cor_guide", ("M", "DIS2D", "NORM"))
-        corrected = distorted(scan.slice.magnitude)
-        self._outbox.push(self._image(scan, twin, corrected), due_s)
+        images.append(self._image(scan, twin, distorted(scan.slice.magnitude)))
+        for image in images:
+            image_type = "\\".join(image.ImageType)
+            uid = str(image.SOPInstanceUID)
+            self._truth.write("extra", sop_instance_uid=uid, image_type=image_type)
+        return images
 
     def _image(
         self,

@@ -60,6 +60,12 @@ class FaultyDirection:
         self._queue: list[tuple[float, int, bytes]] = []
         self._count = 0
         self._wire_free_s = 0.0
+        self._against: FaultyDirection | None = None
+        self.collisions = 0
+
+    def share_wire_with(self, other: "FaultyDirection") -> None:
+        """Half duplex: who talks while the other talks destroys both frames. Needs `byte_s`."""
+        self._against, other._against = other, self
 
     def send(self, data: bytes, now_s: float) -> None:
         self._partial += data
@@ -71,8 +77,13 @@ class FaultyDirection:
     def _send_frame(self, frame: bytes, now_s: float) -> None:
         if not frame:
             return
-        self._wire_free_s = max(self._wire_free_s, now_s) + (len(frame) + 2) * self._byte_s
+        begins_s = max(self._wire_free_s, now_s)
+        self._wire_free_s = begins_s + (len(frame) + 2) * self._byte_s
         self.frames += 1
+        if self._against is not None and self._against._destroyed_from(begins_s):
+            self.collisions += 1
+            self.frames_hit += 1
+            return
         faults, rng = self.faults, self._rng
         if not self.connected or rng.random() < faults.loss:
             self.frames_hit += 1
@@ -85,6 +96,16 @@ class FaultyDirection:
             self._put(at_s, b"\0" + self._damaged(frame) + b"\0")
         if rng.random() < faults.garbage:
             self._put(now_s, rng.randbytes(rng.randint(1, 40)))
+
+    def _destroyed_from(self, at_s: float) -> bool:
+        """Whether a frame of ours is on the wire at `at_s`; if so, it does not arrive."""
+        if at_s >= self._wire_free_s:
+            return False
+        on_the_wire = [entry for entry in self._queue if entry[0] >= self._wire_free_s]
+        for entry in on_the_wire:
+            self._queue.remove(entry)
+        heapq.heapify(self._queue)
+        return True
 
     def _damaged(self, frame: bytes) -> bytes:
         faults, rng = self.faults, self._rng

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import typer
 
@@ -59,6 +59,87 @@ def numerical(
             as_json,
             scheduler,
         )
+
+
+@app.command()
+def benchtop(
+    trials: Annotated[int, typer.Option(help="Punctures a strategy, in rooms of 14.")] = 140,
+    seed: Annotated[int, typer.Option(help="Of every random draw; same seed, same numbers.")] = 1,
+    out: Annotated[Path | None, typer.Option(help="Folder for CSV, PNG and SVG.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="JSON instead of tables.")] = False,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler, as tcp://HOST:PORT.")
+    ] = None,
+    snr: Annotated[float, typer.Option(help="Contrast over noise, one camera pixel.")] = 10.0,
+    step_scatter: Annotated[
+        float, typer.Option(help="Relative scatter of the motors' step length.")
+    ] = 0.002,
+) -> None:
+    """The paper's Table III, benchtop columns: every strategy steers by the camera."""
+    with _one_line_errors():
+        _run_navigation("benchtop", trials, seed, out, as_json, scheduler, snr, step_scatter)
+
+
+@app.command()
+def mri(
+    trials: Annotated[int, typer.Option(help="Punctures a strategy, in rooms of 14.")] = 140,
+    seed: Annotated[int, typer.Option(help="Of every random draw; same seed, same numbers.")] = 1,
+    out: Annotated[Path | None, typer.Option(help="Folder for CSV, PNG and SVG.")] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="JSON instead of tables.")] = False,
+    scheduler: Annotated[
+        str | None, typer.Option(help="Address of a Dask scheduler, as tcp://HOST:PORT.")
+    ] = None,
+    snr: Annotated[float, typer.Option(help="Signal over noise per channel, one pixel.")] = 10.0,
+    step_scatter: Annotated[
+        float, typer.Option(help="Relative scatter of the motors' step length.")
+    ] = 0.002,
+) -> None:
+    """The paper's Table III, MRI columns: every strategy steers by the virtual scanner."""
+    with _one_line_errors():
+        _run_navigation("mri", trials, seed, out, as_json, scheduler, snr, step_scatter)
+
+
+def _run_navigation(
+    setup: Literal["benchtop", "mri"],
+    trials: int,
+    seed: int,
+    out: Path | None,
+    as_json: bool,
+    scheduler: str | None,
+    snr: float,
+    step_scatter: float,
+) -> None:
+    checks = (
+        (3 <= trials <= 1_000_000, f"--trials is {trials}; 3 to 1000000 are possible"),
+        (0 <= seed < 2**31, f"--seed is {seed}; 0 to 2147483647 is possible"),
+        (5.0 <= snr <= 1e6, f"--snr is {snr:g}; 5 to 1000000 is possible"),
+        (0.0 <= step_scatter <= 0.05, f"--step-scatter is {step_scatter:g}; 0 to 0.05 is possible"),
+    )
+    for holds, message in checks:
+        if not holds:
+            raise ValueError(message)
+    # Loaded here, so that the command's help costs nothing.
+    from rich.console import Console
+
+    from studies import cluster, navigation_report, navigation_study
+
+    if out is not None:
+        out.mkdir(parents=True, exist_ok=True)
+    groups = navigation_study.groups_of(setup, trials, seed, snr, step_scatter)
+    with cluster.mapper(scheduler) as mapper, _progress_bar("rooms", len(groups)) as advance:
+        study = navigation_study.run_study(setup, groups, mapper, advance)
+    files: list[Path] = []
+    if out is not None:
+        files = navigation_report.write_csv(study, out)
+        files += navigation_report.draw_punctures(study, out)
+    if as_json:
+        settings = {"trials": trials, "seed": seed, "snr": snr, "step_scatter": step_scatter}
+        typer.echo(json.dumps(navigation_report.as_json(study, settings, files), allow_nan=False))
+        return
+    console = Console()
+    navigation_report.print_tables(study, console)
+    for file in files:
+        console.print(f"written: {file}", highlight=False)
 
 
 def _run_numerical(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import random
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Protocol, TypeVar
 
 import numpy as np
@@ -73,7 +73,10 @@ class Imaging(Protocol):
     def model_sigma_px(self) -> float: ...
 
     def look(
-        self, stage_mm: Mapping[str, float], rng: np.random.Generator
+        self,
+        stage_mm: Mapping[str, float],
+        rng: np.random.Generator,
+        slice_position_mm: float | None = None,
     ) -> tuple[Array, SliceGeometry]: ...
 
     def true_plane_mm(self, stage_mm: Mapping[str, float]) -> Array:
@@ -91,9 +94,12 @@ class MrImaging:
     model_sigma_px: float = 0.0
 
     def look(
-        self, stage_mm: Mapping[str, float], rng: np.random.Generator
+        self,
+        stage_mm: Mapping[str, float],
+        rng: np.random.Generator,
+        slice_position_mm: float | None = None,
     ) -> tuple[Array, SliceGeometry]:
-        taken = acquire(self.room, stage_mm, rng)
+        taken = acquire(self.room, stage_mm, rng, slice_position_mm=slice_position_mm)
         return taken.magnitude, taken.geometry
 
     def true_plane_mm(self, stage_mm: Mapping[str, float]) -> Array:
@@ -105,14 +111,17 @@ class CameraImaging:
     """The benchtop camera over the same stages."""
 
     room: VirtualRoom
-    camera: Camera = Camera()
+    camera: Camera = field(default_factory=Camera)
     frame_s: float = 27.6
     # what comes nearest to the camera's pixel and the interpolation together, and what it misses
-    psf: Psf | None = Psf("gaussian", (0.3,))
+    psf: Psf | None = field(default_factory=lambda: Psf("gaussian", (0.3,)))
     model_sigma_px: float = 0.022
 
     def look(
-        self, stage_mm: Mapping[str, float], rng: np.random.Generator
+        self,
+        stage_mm: Mapping[str, float],
+        rng: np.random.Generator,
+        slice_position_mm: float | None = None,
     ) -> tuple[Array, SliceGeometry]:
         return photograph(self.room, stage_mm, self.camera, rng)
 
@@ -209,10 +218,10 @@ class OfflineRoom:
             self._slices[max(self._slices) + 1] = []
         hold_id = max(self._slices)
         slices = self._slices[hold_id]
-        while len(slices) < step.count:
-            pixels, geometry = self.imaging.look(self.stage_mm, self._rng)
+        while len(_at_position(slices, step.slice_position_mm)) < step.count:
+            pixels, geometry = self.imaging.look(self.stage_mm, self._rng, step.slice_position_mm)
             slices.append(SeenSlice(pixels, geometry, self._row(hold_id)))
-        return Acquired(hold_id, len(slices))
+        return Acquired(hold_id, step.count)
 
     def _row(self, hold_id: int) -> SliceRow:
         """What the record would hold of the next slice; time is the scanner's alone."""
@@ -239,7 +248,11 @@ class OfflineRoom:
 
     def _measure(self, step: Measure) -> Measured:
         self._measurements += 1
-        taken = [(one, hold.shift_mm) for hold in step.holds for one in self._slices[hold.hold_id]]
+        taken = [
+            (one, hold.shift_mm)
+            for hold in step.holds
+            for one in _at_position(self._slices[hold.hold_id], step.slice_position_mm)
+        ]
         geometry = taken[0][0].geometry
         frames = Frames(
             np.array([one.pixels for one, _ in taken]),
@@ -271,6 +284,17 @@ def drive(stage: PiezoLegsStage, steps: float) -> None:
 
 def plane_of(geometry: SliceGeometry) -> ImagePlane:
     return ImagePlane(geometry.row_direction, geometry.col_direction, geometry.spacing_mm)
+
+
+def _at_position(slices: list[SeenSlice], position_mm: float | None) -> list[SeenSlice]:
+    """Those whose middle lies there along their normal; None: all."""
+    if position_mm is None:
+        return slices
+    return [
+        one
+        for one in slices
+        if abs(float(one.geometry.normal @ one.geometry.position_mm) - position_mm) <= 0.5
+    ]
 
 
 def _agree(question: AskOperator) -> str:

@@ -5,6 +5,7 @@ of its own), when operators armed, and when a STOP frame reached the bridge's en
 it looks at what the stage really did. Everything follows from the seed.
 """
 
+import bisect
 import random
 from collections import Counter
 from dataclasses import dataclass, field
@@ -78,6 +79,7 @@ class Campaign:
         self.asked: dict[str, Asked] = {}
         self.outcomes: dict[str, MoveOutcome] = {}
         self.armings_s: list[float] = []
+        self.opened_s: list[float] = []
         self.findings = Findings()
         self._position_asked = 0
         self._stop_at_s: float | None = None
@@ -148,6 +150,7 @@ class Campaign:
         for _ in range(20):
             try:
                 self.client.open(3.0)
+                self.opened_s.append(self.room.clock())
                 return
             except LinkLostError:
                 self.room.plug_in()
@@ -242,8 +245,9 @@ class Campaign:
     def _judge_motion(self, at_s: float, asked: Asked) -> None:
         findings = self.findings
         findings.moves_of_refused += asked.should_be_refused
-        armed_s = max((s for s in self.armings_s if s <= at_s), default=None)
-        if armed_s is None:
+        # A session begins disarmed: someone must have armed since it was opened.
+        armed_s = _last(self.armings_s, at_s)
+        if armed_s < _last(self.opened_s, at_s):
             findings.moves_unarmed += 1
             return
         stops = [stop for stop in self.room.stops_delivered if stop.at_s <= at_s]
@@ -255,7 +259,7 @@ class Campaign:
         first_s: dict[int, float] = {}
         for stop in stops:
             first_s.setdefault(stop.nonce, stop.at_s)
-        carried_out_s = max((s for s in self._rearmed_s if s <= at_s), default=-1.0)
+        carried_out_s = _last(self._rearmed_s, at_s)
         obeyed = carried_out_s >= stops[-1].at_s and armed_s >= max(first_s.values())
         findings.moves_after_stop += not obeyed
 
@@ -277,6 +281,12 @@ class Campaign:
                 agree = agree and outcome.readback_um == self.asked[command_id].setpoints_um
             self.findings.disagreements += not (agree and outcome.state.final)
         assert len(self.outcomes) == len(self.asked), "a command without an end"
+
+
+def _last(times_s: list[float], until_s: float) -> float:
+    """The last of the ascending times that is not after `until_s`, or -1."""
+    place = bisect.bisect_right(times_s, until_s)
+    return times_s[place - 1] if place else -1.0
 
 
 def again_asked_moves_nothing(campaign: Campaign, sample: int) -> bool:

@@ -1,5 +1,6 @@
 """The client against the bridge in virtual time, on a clean line."""
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -9,11 +10,14 @@ from virtual_room import VirtualRoom
 from robot_bridge.client import LinkLostError, RefusedError
 from robot_bridge.messages import CommandState
 from robot_bridge.phases import WorkPhase
+from simulator.serial_line import LineFaults
 
 
 @pytest.fixture
-def room(tmp_path: Path) -> VirtualRoom:
-    return VirtualRoom(tmp_path, seed=1)
+def room(tmp_path: Path) -> Iterator[VirtualRoom]:
+    room = VirtualRoom(tmp_path, seed=1)
+    yield room
+    room.close()
 
 
 def ready(room: VirtualRoom):
@@ -144,3 +148,27 @@ def test_what_is_not_a_whole_micrometre_never_reaches_the_line(room: VirtualRoom
     assert (outcome.state, outcome.code) == (CommandState.REFUSED, "malformed")
     assert "xt" in outcome.text
     assert room.stage.begun == []
+
+
+def test_closing_sees_a_requested_stop_through(room: VirtualRoom):
+    client = ready(room)
+    room.set_faults(LineFaults(loss=1.0))
+    client.request_stop()
+    room.set_faults(LineFaults())
+    client.close()
+    assert room.bridge is not None
+    assert room.bridge.stopped
+    assert room.bridge.stop_reason == "operator_stop"
+
+
+def test_a_stray_motion_is_stopped_and_latched_once(room: VirtualRoom):
+    client = ready(room)
+    room.motors.move_to(at(8000))  # not by any command
+    client.pump(0.5)
+    assert not room.stage.moving
+    assert client.status.stop_reason == "motor_fault"
+    count = client.status.stop_count
+    room.motors.move_to(at(-8000))
+    client.pump(0.5)
+    assert not room.stage.moving
+    assert client.status.stop_count == count

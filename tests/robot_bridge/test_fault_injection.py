@@ -18,6 +18,7 @@ def run(folder: Path, seed: int, commands: int) -> Campaign:
     assert sum(findings.harm.values()) == 0, (seed, findings)
     assert findings.commands >= commands
     assert again_asked_moves_nothing(campaign, sample=min(50, commands))
+    campaign.room.close()
     return campaign
 
 
@@ -32,6 +33,19 @@ def test_no_fault_of_line_or_process_moves_wrongly_or_twice(tmp_path: Path, seed
     assert campaign.room.restarts > 5
     assert campaign.room.to_bridge.frames_hit > 100
     assert len(campaign.room.stops_delivered) > 5
+
+
+@pytest.mark.parametrize("baud", [115200, 57600])
+def test_on_one_pair_of_wires_with_collisions_and_echoes_it_still_works(tmp_path: Path, baud: int):
+    campaign = Campaign(tmp_path, seed=baud)
+    campaign.room.make_half_duplex(byte_s=10 / baud)
+    findings = campaign.run(300)
+    assert sum(findings.harm.values()) == 0, findings
+    assert findings.states["DONE"] > 200, findings
+    room = campaign.room
+    assert room.to_bridge.collisions + room.to_service.collisions > 0
+    assert campaign.client.counters.own_echoes > 100
+    room.close()
 
 
 @pytest.mark.soak

@@ -54,7 +54,7 @@ def test_a_crash_at_any_byte_leaves_a_journal_that_knows_all_whole_lines(tmp_pat
         folder = tmp_path / str(size)
         folder.mkdir()
         (folder / FILE_NAME).write_bytes(data[:size])
-        journal = Journal(folder)
+        journal = Journal(folder, sync=lambda descriptor: None)
         lines = data[:size].count(b"\n")
         assert ("a" in journal.commands) == (lines >= 1)
         assert journal.insertion_locked == (lines >= 3)

@@ -4,7 +4,9 @@ The expectation is written down here a second time, in other words than the prog
 what each request needs. Whatever is not allowed must change nothing and move nothing.
 """
 
+import contextlib
 import itertools
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -150,6 +152,18 @@ class Bench:
 _number = itertools.count()
 
 
+@contextlib.contextmanager
+def standing(folder: Path, case: Case) -> Iterator[Bench]:
+    bench = Bench(folder, case)
+    try:
+        yield bench
+    except BaseException as error:
+        error.add_note(f"in the standing {case}")
+        raise
+    finally:
+        bench.room.close()
+
+
 def _way_to(phase: WorkPhase) -> list[WorkPhase]:
     ways = {
         P.START_UP: [],
@@ -163,6 +177,11 @@ def _without_time(status: Status) -> Status:
     return Status(**{**status.__dict__, "now_ms": 0, "refused": 0})
 
 
+def test_there_are_many_standings():
+    assert len(CASES) > 100
+    assert {case.phase for case in CASES} == set(P)
+
+
 def test_the_table_of_transitions_is_the_one_written_down_here():
     for now, wanted in itertools.product(P, P):
         expected = wanted in TRANSITIONS[now] or wanted is now
@@ -172,161 +191,167 @@ def test_the_table_of_transitions_is_the_one_written_down_here():
     assert all(ALLOWED[phase].after_rearm is P.START_UP for phase in LATCHED)
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
-def test_a_move_begins_only_where_everything_allows_it(folder: Path, case: Case):
-    bench = Bench(folder, case)
-    answer = bench.ask(bench.move("new", 500))
-    allowed = (
-        case.phase in MAY_MOVE and case.armed and case.certain
-        and not (case.locked or case.moving or case.fault)
-    )  # fmt: skip
-    assert (answer.state == CommandState.ACCEPTED) == allowed
-    if not allowed:
-        assert answer.state == CommandState.REFUSED
-        assert answer.code != Code.OK
-        assert answer.text
-        assert _without_time(bench.bridge.status()) == _without_time(bench.before)
-        assert bench.room.commands["new"].state is CommandState.REFUSED
-    assert bench.began_something == allowed
+def test_a_move_begins_only_where_everything_allows_it(folder: Path):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            answer = bench.ask(bench.move("new", 500))
+            allowed = (
+                case.phase in MAY_MOVE and case.armed and case.certain
+                and not (case.locked or case.moving or case.fault)
+            )  # fmt: skip
+            assert (answer.state == CommandState.ACCEPTED) == allowed
+            if not allowed:
+                assert answer.state == CommandState.REFUSED
+                assert answer.code != Code.OK
+                assert answer.text
+                assert _without_time(bench.bridge.status()) == _without_time(bench.before)
+                assert bench.room.commands["new"].state is CommandState.REFUSED
+            assert bench.began_something == allowed
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
-def test_homing_begins_only_where_everything_allows_it(folder: Path, case: Case):
-    bench = Bench(folder, case)
-    answer = bench.ask(Home("new", "test", bench.now_ms))
-    allowed = (
-        case.phase in MAY_HOME and case.armed and not (case.locked or case.moving or case.fault)
-    )
-    assert (answer.state == CommandState.ACCEPTED) == allowed, answer
-    assert bench.began_something == allowed
+def test_homing_begins_only_where_everything_allows_it(folder: Path):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            answer = bench.ask(Home("new", "test", bench.now_ms))
+            allowed = (
+                case.phase in MAY_HOME
+                and case.armed
+                and not (case.locked or case.moving or case.fault)
+            )
+            assert (answer.state == CommandState.ACCEPTED) == allowed, answer
+            assert bench.began_something == allowed
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
-def test_arming_is_for_an_unlatched_bridge_without_faults(folder: Path, case: Case):
-    bench = Bench(folder, case)
-    answer = bench.ask(Arm("test", bench.before.stop_count, bench.now_ms))
-    allowed = case.phase not in LATCHED and not case.fault
-    assert (answer.code == Code.OK) == allowed
-    assert bench.bridge.armed == (allowed or case.armed)
-    assert not bench.began_something
+def test_arming_is_for_an_unlatched_bridge_without_faults(folder: Path):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            answer = bench.ask(Arm("test", bench.before.stop_count, bench.now_ms))
+            allowed = case.phase not in LATCHED and not case.fault
+            assert (answer.code == Code.OK) == allowed
+            assert bench.bridge.armed == (allowed or case.armed)
+            assert not bench.began_something
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
-def test_rearming_is_for_a_latched_bridge_and_names_the_stop(folder: Path, case: Case):
-    bench = Bench(folder, case)
-    latched = case.phase in LATCHED
-    wrong = bench.ask(Rearm("test", bench.before.stop_count + 1, bench.now_ms))
-    assert wrong.code != Code.OK
-    answer = bench.ask(Rearm("test", bench.before.stop_count, bench.now_ms))
-    assert (answer.code == Code.OK) == (latched and not case.fault)
-    if answer.code == Code.OK:
-        assert bench.bridge.phase is P.START_UP
-        assert bench.bridge.armed
-        assert not bench.bridge.stopped
-    else:
-        assert bench.bridge.phase is case.phase
-    assert not bench.began_something
+def test_rearming_is_for_a_latched_bridge_and_names_the_stop(folder: Path):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            latched = case.phase in LATCHED
+            wrong = bench.ask(Rearm("test", bench.before.stop_count + 1, bench.now_ms))
+            assert wrong.code != Code.OK
+            answer = bench.ask(Rearm("test", bench.before.stop_count, bench.now_ms))
+            assert (answer.code == Code.OK) == (latched and not case.fault)
+            if answer.code == Code.OK:
+                assert bench.bridge.phase is P.START_UP
+                assert bench.bridge.armed
+                assert not bench.bridge.stopped
+            else:
+                assert bench.bridge.phase is case.phase
+            assert not bench.began_something
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
-def test_disarming_is_always_done_and_stops_what_runs(folder: Path, case: Case):
-    bench = Bench(folder, case)
-    assert bench.ask(Disarm("test")).code == Code.OK
-    assert not bench.bridge.armed
-    assert not bench.room.stage.moving
-    assert not bench.began_something
+def test_disarming_is_always_done_and_stops_what_runs(folder: Path):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            assert bench.ask(Disarm("test")).code == Code.OK
+            assert not bench.bridge.armed
+            assert not bench.room.stage.moving
+            assert not bench.began_something
 
 
 @pytest.mark.parametrize("wanted", P)
-@pytest.mark.parametrize("case", CASES, ids=str)
-def test_a_phase_is_set_only_along_the_table(folder: Path, case: Case, wanted: WorkPhase):
-    bench = Bench(folder, case)
-    answer = bench.ask(SetPhase(wanted.value, "test", bench.now_ms))
-    allowed = not case.moving and (wanted in TRANSITIONS[case.phase] or wanted is case.phase)
-    allowed = allowed and case.phase not in LATCHED
-    assert (answer.code == Code.OK) == allowed, answer
-    assert bench.bridge.phase is (wanted if allowed else case.phase)
-    assert not bench.began_something
+def test_a_phase_is_set_only_along_the_table(folder: Path, wanted: WorkPhase):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            answer = bench.ask(SetPhase(wanted.value, "test", bench.now_ms))
+            allowed = not case.moving and (
+                wanted in TRANSITIONS[case.phase] or wanted is case.phase
+            )
+            allowed = allowed and case.phase not in LATCHED
+            assert (answer.code == Code.OK) == allowed, answer
+            assert bench.bridge.phase is (wanted if allowed else case.phase)
+            assert not bench.began_something
 
 
 @pytest.mark.parametrize("locked", [True, False])
-@pytest.mark.parametrize("case", CASES, ids=str)
-def test_the_lock_can_always_be_set_and_stops_what_runs(folder: Path, case: Case, locked: bool):
-    bench = Bench(folder, case)
-    assert bench.ask(SetInsertionLock(locked, "test", bench.now_ms)).code == Code.OK
-    assert bench.bridge.insertion_locked == locked
-    if locked:
-        assert not bench.room.stage.moving
-    assert not bench.began_something
+def test_the_lock_can_always_be_set_and_stops_what_runs(folder: Path, locked: bool):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            assert bench.ask(SetInsertionLock(locked, "test", bench.now_ms)).code == Code.OK
+            assert bench.bridge.insertion_locked == locked
+            if locked:
+                assert not bench.room.stage.moving
+            assert not bench.began_something
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
-def test_a_position_is_declared_only_at_standstill(folder: Path, case: Case):
-    bench = Bench(folder, case)
-    bench.room.motors.fault = None
-    answer = bench.ask(DeclarePosition(dict.fromkeys(AXES, 5), "test", bench.now_ms))
-    assert (answer.code == Code.OK) == (not case.moving)
-    assert bench.bridge.certain == (case.certain or not case.moving)
-    assert not bench.began_something
+def test_a_position_is_declared_only_at_standstill(folder: Path):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            bench.room.motors.fault = None
+            answer = bench.ask(DeclarePosition(dict.fromkeys(AXES, 5), "test", bench.now_ms))
+            assert (answer.code == Code.OK) == (not case.moving)
+            assert bench.bridge.certain == (case.certain or not case.moving)
+            assert not bench.began_something
 
 
 @pytest.mark.parametrize("emergency", [False, True])
-@pytest.mark.parametrize("case", CASES, ids=str)
-def test_stop_works_in_every_standing(folder: Path, case: Case, emergency: bool):
-    bench = Bench(folder, case)
-    bench.bridge._receive_stop(StopReceived(99, emergency))
-    wanted = P.EMERGENCY if emergency or case.phase is P.EMERGENCY else P.STOP
-    assert bench.bridge.phase is wanted
-    assert bench.bridge.stopped
-    assert not bench.bridge.armed
-    assert bench.bridge.stop_count == bench.before.stop_count + 1
-    assert not bench.room.stage.moving
-    assert not bench.began_something
-    assert bench.bridge.end.take_output(), "no acknowledgement"
+def test_stop_works_in_every_standing(folder: Path, emergency: bool):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            bench.bridge._receive_stop(StopReceived(99, emergency))
+            wanted = P.EMERGENCY if emergency or case.phase is P.EMERGENCY else P.STOP
+            assert bench.bridge.phase is wanted
+            assert bench.bridge.stopped
+            assert not bench.bridge.armed
+            assert bench.bridge.stop_count == bench.before.stop_count + 1
+            assert not bench.room.stage.moving
+            assert not bench.began_something
+            assert bench.bridge.end.take_output(), "no acknowledgement"
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
-def test_a_new_session_disarms_and_stops_what_runs(folder: Path, case: Case):
-    bench = Bench(folder, case)
-    bench.bridge._open_session(SessionOpened(HelloRequest(2, "other", 1, "x")))
-    assert not bench.bridge.armed
-    assert not bench.room.stage.moving
-    assert bench.bridge.phase is case.phase
-    assert not bench.began_something
+def test_a_new_session_disarms_and_stops_what_runs(folder: Path):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            bench.bridge._open_session(SessionOpened(HelloRequest(2, "other", 1, "x")))
+            assert not bench.bridge.armed
+            assert not bench.room.stage.moving
+            assert bench.bridge.phase is case.phase
+            assert not bench.began_something
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
-def test_silence_latches_a_stop_if_anything_could_move(folder: Path, case: Case):
-    bench = Bench(folder, case)
-    for _ in range(20):
-        bench.room.clock.now_s += 0.1
-        bench.bridge.tick()
-    could_move = case.armed or case.moving
-    assert not bench.bridge.armed
-    assert not bench.room.stage.moving
-    assert bench.bridge.stopped == (could_move or case.phase in LATCHED)
-    assert not bench.began_something
+def test_silence_latches_a_stop_if_anything_could_move(folder: Path):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            for _ in range(20):
+                bench.room.clock.now_s += 0.1
+                bench.bridge.tick()
+            could_move = case.armed or case.moving
+            assert not bench.bridge.armed
+            assert not bench.room.stage.moving
+            assert bench.bridge.stopped == (could_move or case.phase in LATCHED)
+            assert not bench.began_something
 
 
-@pytest.mark.parametrize("case", CASES, ids=str)
-def test_requests_sent_too_long_ago_are_refused_whatever_they_ask(folder: Path, case: Case):
-    bench = Bench(folder, case)
-    old_ms = bench.now_ms - 1001
-    old = [
-        Arm("test", bench.before.stop_count, old_ms),
-        Rearm("test", bench.before.stop_count, old_ms),
-        SetPhase(P.MANUAL.value, "test", old_ms),
-        SetInsertionLock(False, "test", old_ms),
-        DeclarePosition(dict.fromkeys(AXES, 5), "test", old_ms),
-        Move("late", dict.fromkeys(AXES, 5), None, bench.bridge.last_motion, old_ms),
-        Home("late home", "test", old_ms),
-    ]
-    for request in old:
-        assert bench.ask(request).code == Code.STALE_COMMAND
-    future = Move("early", dict.fromkeys(AXES, 5), None, bench.bridge.last_motion, old_ms + 9999)
-    assert bench.ask(future).code == Code.STALE_COMMAND
-    assert _without_time(bench.bridge.status()) == _without_time(bench.before)
-    assert not bench.began_something
+def test_requests_sent_too_long_ago_are_refused_whatever_they_ask(folder: Path):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            old_ms = bench.now_ms - 1001
+            old = [
+                Arm("test", bench.before.stop_count, old_ms),
+                Rearm("test", bench.before.stop_count, old_ms),
+                SetPhase(P.MANUAL.value, "test", old_ms),
+                SetInsertionLock(False, "test", old_ms),
+                DeclarePosition(dict.fromkeys(AXES, 5), "test", old_ms),
+                Move("late", dict.fromkeys(AXES, 5), None, bench.bridge.last_motion, old_ms),
+                Home("late home", "test", old_ms),
+            ]
+            for request in old:
+                assert bench.ask(request).code == Code.STALE_COMMAND
+            future = Move(
+                "early", dict.fromkeys(AXES, 5), None, bench.bridge.last_motion, old_ms + 9999
+            )
+            assert bench.ask(future).code == Code.STALE_COMMAND
+            assert _without_time(bench.bridge.status()) == _without_time(bench.before)
+            assert not bench.began_something
 
 
 def test_there_is_no_other_request_than_those_tested_here():

@@ -1,6 +1,8 @@
 """Faults of line, controller, motor and encoder: a typed fault, and all motors stopped."""
 
+import os
 import time
+import tty
 
 import pytest
 from pmd_rig import Rig, axis_config, finish, opened, rig, wait_until
@@ -9,6 +11,7 @@ from robot_bridge.emulator_physics import IdealStage
 from robot_bridge.emulator_switches import Switches
 from robot_bridge.motors import MotorError
 from robot_bridge.pmd401 import PmdMotors
+from robot_bridge.pmd_ports import SerialPort
 
 
 def in_motion(motors: PmdMotors, made: Rig, um: int = 15_000) -> None:
@@ -305,3 +308,83 @@ def test_a_shift_by_parking_is_told():
         assert status.readback_um["xt"] == 530
         assert not status.reached
         assert any("parking moved it by +30 um" in warning for warning in status.warnings)
+
+
+def test_after_a_limit_switch_the_axis_can_leave_it_again():
+    with rig(speed_factor=2.0) as made, opened(made, "closed_loop") as motors:
+        with made.lock:
+            made.controller(1).settings.store(2, 1)
+        in_motion(motors, made)
+        with made.lock:
+            made.controller(1).faults.limit_switch = True
+        assert finish(motors).fault == "external_limit"
+        settled(motors)
+        with made.lock:
+            made.controller(1).faults.limit_switch = False
+        motors.stop()
+        motors.move_to({"xt": 0, "yt": 0})
+        assert finish(motors).reached
+
+
+def test_a_limit_switch_is_as_good_a_reference_as_a_hard_stop():
+    with rig() as made, opened(made, declare=False) as motors:
+        for address in (1, 2):
+            with made.lock:
+                made.controller(address).settings.store(2, 1)
+        motors.home()
+        wait_until(motors, lambda s: made.position_um(1) < -300 and made.position_um(2) < -300)
+        with made.lock:
+            for address in (1, 2):
+                made.controller(address).faults.limit_switch = True
+        status = finish(motors)
+        assert status.fault is None
+        assert status.certain
+        assert status.readback_um == {"xt": -20_000, "yt": -20_000}
+
+
+def test_parking_and_declaring_are_possible_in_spite_of_a_fault():
+    with rig() as made, opened(made) as motors:
+        with made.lock:
+            made.controller(1).faults.overheat = True
+        wait_until(motors, lambda s: s.fault == "overheat")
+        motors.park()
+        wait_until(motors, lambda s: s.parked)
+        motors.declare_position({"xt": 5})
+
+
+def test_a_port_that_comes_back_is_opened_again_and_the_position_is_uncertain(tmp_path):
+    link = tmp_path / "controllers"
+    with rig() as first:
+        link.symlink_to(first.url)
+        with opened(first, "closed_loop", controller=str(link)) as motors:
+            motors.move_to({"xt": 500, "yt": 0})
+            finish(motors)
+            first.running = False
+            time.sleep(0.05)
+            first.server.wire.close()
+            status = wait_until(motors, lambda s: s.fault is not None)
+            assert not status.certain
+            with pytest.raises(MotorError):
+                motors.move_to({"xt": 0, "yt": 0})
+            with rig() as second:
+                link.unlink()
+                link.symlink_to(second.url)
+                status = wait_until(motors, lambda s: s.fault is None)
+                assert not status.certain
+                motors.declare_position({"xt": 0, "yt": 0})
+                motors.move_to({"xt": 300, "yt": 0})
+                assert finish(motors).reached
+                assert second.position_um(1) == pytest.approx(300, abs=1)
+
+
+def test_a_port_that_takes_no_bytes_is_an_error_within_its_bound():
+    reader, writer = os.openpty()
+    tty.setraw(writer)
+    port = SerialPort(os.ttyname(writer), 115200)
+    begun_s = time.monotonic()
+    with pytest.raises(OSError, match="takes no more bytes"):
+        port.write(b"X" * 200_000)
+    assert time.monotonic() - begun_s < 0.5
+    port.close()
+    os.close(reader)
+    os.close(writer)

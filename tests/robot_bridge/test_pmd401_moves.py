@@ -221,3 +221,12 @@ def test_the_speed_is_capped_by_what_the_controller_measured():
             run = made.controller(1).run
             assert run is None or run.frequency_hz == 457
         assert finish(motors).reached
+
+
+def test_the_response_delay_is_set_at_every_opening():
+    with rig() as made:
+        for delay_us in (200, 20):
+            motors = PmdMotors([axis_config("xt", made.url, 1)], response_delay_us=delay_us)
+            motors.open()
+            motors.close()
+            assert made.controller(1).settings[44] == delay_us

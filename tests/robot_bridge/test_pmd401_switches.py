@@ -1,12 +1,16 @@
 """Where the manuals are silent or contradicted, the driver works with either answer, unchanged."""
 
 import itertools
+import time
 
 import pytest
-from pmd_rig import finish, opened, rig, wait_until
+from pmd_rig import axis_config, finish, opened, rig, wait_until
+from virtual_line import VirtualLine
 
 from robot_bridge.emulator_axis import Motor
 from robot_bridge.emulator_switches import Switches
+from robot_bridge.motors import POLL_BOUND_S, STOP_BOUND_S
+from robot_bridge.pmd401 import PmdMotors
 
 SINGLE = [
     Switches(terminator="cr"),
@@ -22,6 +26,7 @@ SINGLE = [
     Switches(broadcast_stop=False),
     Switches(encoder_type_description=False),
     Switches(bare_status=False),
+    Switches(collisions="lost"),
 ]
 COMBINED = [
     Switches(terminator=terminator, run_answer="222", hex_case="upper", own_echo=echo)
@@ -86,3 +91,54 @@ def test_stop_needs_no_broadcast(broadcast_works: bool):
         motors.stop()
         with made.lock:
             assert not any(c.moving for c in made.bus.controllers)
+
+
+@pytest.mark.parametrize("into_the_answer_s", [0.0001, 0.0004, 0.0008])
+def test_stop_gets_through_although_it_collides_with_an_answer(into_the_answer_s: float):
+    line = VirtualLine(
+        {"xt": "open_loop", "yt": "closed_loop"}, switches=Switches(collisions="lost")
+    )
+    line.open_at_zero()
+    line.motors.move_to({"xt": 15_000, "yt": 15_000})
+    line.poll(10)
+    assert line.moving()
+    line.write(b"X1U0\r")
+    line.wait(into_the_answer_s)
+    before = line.bus.collisions
+    begun_s = line.now_s
+    line.motors.stop()
+    assert line.bus.collisions == before + 1
+    assert not line.moving()
+    assert line.now_s - begun_s < 0.1
+
+
+@pytest.mark.parametrize("latency_s", [0.001, 0.016])
+def test_four_axes_on_one_bus_behind_a_slow_adapter(latency_s: float):
+    names = ("xt", "yt", "xb", "yb")
+    with rig((1, 2, 3, 4), speed_factor=2.0) as made:
+        made.bus.faults.reply_delay_s = latency_s
+        axes = [axis_config(name, made.url, k) for k, name in enumerate(names, 1)]
+        motors = PmdMotors(axes)
+        motors.open()
+        motors.declare_position(dict.fromkeys(names, 0))
+        longest_s, moving = 0.0, True
+        motors.move_to({name: 1000 * k for k, name in enumerate(names, 1)})
+        while moving:
+            begun_s = time.monotonic()
+            status = motors.poll()
+            longest_s = max(longest_s, time.monotonic() - begun_s)
+            moving = status.moving
+            time.sleep(0.005)
+        assert status.reached, status
+        assert longest_s < POLL_BOUND_S
+        assert [made.position_um(k) for k in (1, 2, 3, 4)] == [
+            pytest.approx(1000 * k, abs=1) for k in (1, 2, 3, 4)
+        ]
+        motors.move_to(dict.fromkeys(names, 15_000))
+        wait_until(motors, lambda s: made.position_um(4) > 5000)
+        begun_s = time.monotonic()
+        motors.stop()
+        assert time.monotonic() - begun_s < STOP_BOUND_S
+        with made.lock:
+            assert not any(c.moving for c in made.bus.controllers)
+        motors.close()

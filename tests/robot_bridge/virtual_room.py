@@ -6,7 +6,6 @@ clock, the wire and the motors are models. Everything follows from one seed.
 
 import json
 import random
-from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -55,6 +54,7 @@ class VirtualRoom:
         self.bridge: Bridge | None = None
         self.bridge_back_s = 0.0
         self.restarts = 0
+        self.echoes = False
         self.crash_at_sync = -1  # the how-manieth fsync from now kills the bridge; -1: none
         self._folder = folder
         self._deadman_s = deadman_s
@@ -92,6 +92,10 @@ class VirtualRoom:
         self.stage.halt()
         self.bridge_back_s = self.clock() + away_s
 
+    def close(self) -> None:
+        assert self._journal is not None
+        self._journal.close()
+
     @property
     def commands(self) -> dict[str, CommandRecord]:
         assert self._journal is not None
@@ -124,6 +128,8 @@ class VirtualRoom:
             self.crash_bridge()
             return
         self.to_service.send(output, self.clock())
+        if self.echoes and output and self.bridge is not None:
+            self.bridge.receive(output)
 
     def run(self, seconds: float) -> None:
         for _ in range(round(seconds / STEP_S)):
@@ -146,6 +152,15 @@ class VirtualRoom:
         self.to_bridge.faults = faults
         self.to_service.faults = faults
 
+    def make_half_duplex(self, byte_s: float) -> None:
+        """One pair of wires: collisions destroy, and everybody hears himself."""
+        self.to_bridge, self.to_service = (
+            FaultyDirection(LineFaults(), random.Random(self.rng.random()), byte_s)
+            for _ in range(2)
+        )
+        self.to_bridge.share_wire_with(self.to_service)
+        self.echoes = True
+
     def unplug(self) -> None:
         for direction in (self.to_bridge, self.to_service):
             direction.connected = False
@@ -157,21 +172,24 @@ class VirtualRoom:
 
 @dataclass
 class VirtualTransport:
-    """The service's port; waiting on it is what makes time pass. `meanwhile` runs every step."""
+    """The service's port; waiting on it is what makes time pass."""
 
     room: VirtualRoom
-    meanwhile: list[Callable[[], None]] = field(default_factory=list)
+    echo: bytearray = field(default_factory=bytearray)
 
     def read(self, wait_s: float) -> bytes:
         until_s = self.room.clock() + wait_s
         while True:
-            data = self.room.to_service.take_due(self.room.clock())
+            data = bytes(self.echo) + self.room.to_service.take_due(self.room.clock())
+            self.echo.clear()
             if data or self.room.clock() >= until_s:
                 return data
             self.room.step()
 
     def write(self, data: bytes) -> None:
         self.room.to_bridge.send(data, self.room.clock())
+        if self.room.echoes:
+            self.echo += data
 
     def close(self) -> None:
         pass

@@ -3,6 +3,7 @@
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 from collections.abc import Iterator
@@ -28,7 +29,9 @@ from simulator.config import (
 from simulator.faults import FAULTS
 
 ROOT = Path(__file__).parents[2]
-COMMAND = [sys.executable, "-W", "error", "-m", "simulator.command_line"]
+# pynetdicom leaves the socket of a refused connection to the garbage collector
+STRICT = ["-W", "error", "-W", "ignore::ResourceWarning"]
+COMMAND = [sys.executable, *STRICT, "-m", "simulator.command_line"]
 
 
 @pytest.fixture
@@ -62,11 +65,11 @@ def scanner(*arguments: str) -> Iterator[subprocess.Popen[bytes]]:
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
     )
-    try:
-        with process:
+    with process:
+        try:
             yield process
-    finally:
-        process.kill()
+        finally:
+            process.kill()
 
 
 def ready(process: subprocess.Popen[bytes]) -> dict[str, Any]:
@@ -190,3 +193,28 @@ def test_impossible_rooms_are_refused(table: dict[str, Any], message: str) -> No
     with pytest.raises(VirtualRoomError, match=message) as caught:
         parse_virtual_room(table)
     assert "\n" not in str(caught.value)
+
+
+def test_a_listener_that_is_not_there_is_one_line_on_stderr_for_each_slice(
+    config: Path, page: Page, receiver: Receiver
+) -> None:
+    with socket.socket() as unused:
+        unused.bind(("127.0.0.1", 0))
+        port = unused.getsockname()[1]
+        text = config.read_text().replace(
+            f"listener_port = {receiver.port}",
+            f"""
+        listener_port = {port}
+        retries = 2
+        retry_s = 0.05""",
+        )
+        config.write_text(text)
+        with scanner("--config", str(config)) as process:
+            ready(process)
+            page.ask_for("r1", count=2)
+            assert process.stderr is not None
+            lines = [json.loads(process.stderr.readline()) for _ in range(2)]
+            process.terminate()
+            assert process.wait(timeout=10) == 0
+            assert process.stderr.read() == b""
+    assert all("could not be delivered: no association" in line["note"] for line in lines)

@@ -153,6 +153,7 @@ def test_dcmtks_storescp_takes_the_slices(
     command = ["storescp", "-aet", "AUTOSPINE", "-od", str(folder), "-fe", ".dcm", str(port)]
     with subprocess.Popen(command) as storescp:
         try:
+            _wait_until_somebody_listens(port)
             running = start({"listener_port": port, "sop_class": sop_class})
             page.ask_for("r1", count=3)
             deliveries = running.wait_for_truth(3, "delivery")
@@ -270,6 +271,17 @@ def _distance_to_a_slice_of_a_standing_robot(
     row, col = np.rint(line["fiducials"]["upper"]["centre_px"]).astype(int)
     near = (slice(row - 7, row + 8), slice(col - 7, col + 8))
     return float(np.sqrt(np.mean((dataset.pixel_array[near] - model[near]) ** 2)))
+
+
+def _wait_until_somebody_listens(port: int) -> None:
+    deadline_s = time.monotonic() + 10
+    while True:
+        try:
+            socket.create_connection(("127.0.0.1", port)).close()
+            return
+        except ConnectionRefusedError:
+            assert time.monotonic() < deadline_s
+            time.sleep(0.02)
 
 
 @contextmanager

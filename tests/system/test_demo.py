@@ -9,6 +9,7 @@ import pytest
 
 from case_record.record import CaseRecord
 from simulator.demo_room import known_faults
+from simulator.misassigned import misassigned, read_truth
 
 PROCESSES = {
     "service": "command_line service",
@@ -133,3 +134,6 @@ def test_a_fault_of_the_scanner_costs_slices_but_no_accuracy(demo, fault):
     if ended.code == 0:
         assert_good(ended.results(), 1)
     assert "Traceback" not in ended.err
+    with CaseRecord(running.case_dir) as record:
+        truth = read_truth(running.case_dir / "virtual" / "acquisitions.jsonl")
+        assert misassigned(record.slices(), truth) == []

@@ -1,0 +1,221 @@
+"""The API as a program sees it: a small typed client on httpx.
+
+Every refusal is a `RefusedByServiceError` with the problem's code and text; a service that does not
+answer is a `ServiceGoneError`. Orders carry an idempotency key, so one that is sent again because
+its answer was lost is not carried out twice.
+"""
+
+from __future__ import annotations
+
+import json
+import uuid
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from types import TracebackType
+from typing import Any, TypeVar
+
+import httpx
+from pydantic import BaseModel, TypeAdapter
+
+from service.bodies import EventBody, MeasurementBody, SessionBody, SliceBody, Started
+from service.state import RoomState
+
+_TIMEOUT_S = 35.0
+_STOP_TIMEOUT_S = 2.0
+_SILENT_S = 5.0
+Model = TypeVar("Model", bound=BaseModel)
+
+
+class ServiceGoneError(Exception):
+    """The service does not answer; the text names its address and why."""
+
+
+class RefusedByServiceError(Exception):
+    """The service refused; `code` is for programs, the text says what to do."""
+
+    def __init__(self, status: int, code: str, detail: str) -> None:
+        super().__init__(detail)
+        self.status = status
+        self.code = code
+
+
+@dataclass(frozen=True)
+class LiveMessage:
+    """One message of the event stream: `state`, `record` or `beat`; event_id of `record` only."""
+
+    kind: str
+    body: Mapping[str, Any]
+    event_id: int | None = None
+
+
+class RoomClient:
+    """Talks to one service; use it as a context manager."""
+
+    def __init__(self, url: str, *, token: str = "", by: str = "operator") -> None:
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        self.url = url
+        self._by = by
+        self._http = httpx.Client(base_url=url, headers=headers, timeout=_TIMEOUT_S)
+
+    def close(self) -> None:
+        self._http.close()
+
+    def __enter__(self) -> RoomClient:
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        at: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    # Looking
+
+    def state(self) -> RoomState:
+        """What the room is doing now."""
+        return self._get("/api/v1/state", RoomState)
+
+    def session(self) -> SessionBody:
+        """Who this client is to the service."""
+        return self._get("/api/v1/session", SessionBody)
+
+    def events(self, after: int = 0, limit: int = 1000) -> list[EventBody]:
+        """What happened after an event id, oldest first."""
+        return self._list("/api/v1/events", EventBody, after=after, limit=limit)
+
+    def slices(
+        self, after: int = 0, limit: int = 1000, state: str | None = None
+    ) -> list[SliceBody]:
+        wanted = {} if state is None else {"state": state}
+        return self._list("/api/v1/slices", SliceBody, after=after, limit=limit, **wanted)
+
+    def measurements(self, after: int = 0, limit: int = 1000) -> list[MeasurementBody]:
+        return self._list("/api/v1/measurements", MeasurementBody, after=after, limit=limit)
+
+    def slice_png(self, slice_id: int, scale: int = 1) -> bytes:
+        path = f"/api/v1/slices/{slice_id}/image.png"
+        return self._ask("GET", path, params={"scale": scale}).content
+
+    def slice_dicom(self, slice_id: int) -> bytes:
+        """The DICOM file, bit for bit as it was received."""
+        return self._ask("GET", f"/api/v1/slices/{slice_id}/image.dcm").content
+
+    def live(self, after: int = 0) -> Iterator[LiveMessage]:
+        """Follow the event stream from an event id on; ServiceGoneError when it ends."""
+        timeout = httpx.Timeout(_TIMEOUT_S, read=_SILENT_S)
+        headers = {"Last-Event-ID": str(after)} if after else {}
+        try:
+            with self._http.stream(
+                "GET", "/api/v1/events/live", headers=headers, timeout=timeout
+            ) as stream:
+                if stream.status_code != httpx.codes.OK:
+                    stream.read()
+                    raise _refusal(stream)
+                yield from _messages(stream.iter_lines())
+        except httpx.TransportError as error:
+            raise self._gone(error) from error
+        raise ServiceGoneError(f"{self.url}: the event stream ended")
+
+    # Orders
+
+    def stop(self, *, emergency: bool = False) -> None:
+        """STOP. Returns when the service has put it onto the line."""
+        body = {"by": self._by, "emergency": emergency}
+        self._ask("POST", "/api/v1/stop", json=body, timeout=_STOP_TIMEOUT_S)
+
+    def reset(self) -> None:
+        """Clear a latched stop, take the positions as they stand, and arm."""
+        self._order("POST", "/api/v1/reset")
+
+    def start_calibration(self) -> int:
+        return self._start("/api/v1/calibration")
+
+    def set_target(self, patient_mm: Sequence[float]) -> None:
+        self._order("PUT", "/api/v1/target", patient_mm=list(patient_mm))
+
+    def set_entry(self, patient_mm: Sequence[float]) -> None:
+        self._order("PUT", "/api/v1/entry", patient_mm=list(patient_mm))
+
+    def start_approach(self) -> int:
+        return self._start("/api/v1/approach")
+
+    def jog(self, axis: str, distance_um: int) -> int:
+        return self._start("/api/v1/jog", axis=axis, distance_um=distance_um)
+
+    def answer(self, question_id: str, choice: str, plan_id: str | None = None) -> None:
+        self._order(
+            "POST", "/api/v1/answer", question_id=question_id, choice=choice, plan_id=plan_id
+        )
+
+    def abort(self) -> None:
+        self._order("POST", "/api/v1/abort")
+
+    def record_puncture(self, insertion_depth_mm: float | None = None) -> None:
+        self._order("POST", "/api/v1/puncture", insertion_depth_mm=insertion_depth_mm)
+
+    def needle_out(self) -> None:
+        self._order("POST", "/api/v1/needle-out")
+
+    def describe_case(self, label: str, operator: str = "", note: str = "") -> None:
+        self._order("PUT", "/api/v1/case", label=label, operator=operator, note=note)
+
+    def assign_slice(self, slice_id: int, hold_id: int | None, why: str = "") -> None:
+        path = f"/api/v1/slices/{slice_id}/assignment"
+        self._order("POST", path, hold_id=hold_id, why=why)
+
+    # Inside
+
+    def _start(self, path: str, **fields: Any) -> int:
+        return Started.model_validate_json(self._order("POST", path, **fields).text).procedure_id
+
+    def _order(self, method: str, path: str, **fields: Any) -> httpx.Response:
+        key = {"Idempotency-Key": uuid.uuid4().hex}
+        body = {"by": self._by, **fields}
+        try:
+            return self._ask(method, path, json=body, headers=key)
+        except ServiceGoneError:
+            return self._ask(method, path, json=body, headers=key)
+
+    def _get(self, path: str, model: type[Model]) -> Model:
+        return model.model_validate_json(self._ask("GET", path).text)
+
+    def _list(self, path: str, model: type[Model], **params: Any) -> list[Model]:
+        return TypeAdapter(list[model]).validate_json(  # type: ignore[valid-type]
+            self._ask("GET", path, params=params).text
+        )
+
+    def _ask(self, method: str, path: str, **options: Any) -> httpx.Response:
+        try:
+            answer = self._http.request(method, path, **options)
+        except httpx.TransportError as error:
+            raise self._gone(error) from error
+        if answer.is_error:
+            raise _refusal(answer)
+        return answer
+
+    def _gone(self, error: httpx.TransportError) -> ServiceGoneError:
+        return ServiceGoneError(f"{self.url}: {str(error) or type(error).__name__}")
+
+
+def _refusal(answer: httpx.Response) -> RefusedByServiceError:
+    try:
+        problem = answer.json()
+        return RefusedByServiceError(answer.status_code, problem["title"], problem["detail"])
+    except (ValueError, KeyError, TypeError):
+        return RefusedByServiceError(answer.status_code, "http_error", answer.reason_phrase)
+
+
+def _messages(lines: Iterator[str]) -> Iterator[LiveMessage]:
+    fields: dict[str, str] = {}
+    for line in lines:
+        if line:
+            name, _, value = line.partition(":")
+            fields[name] = value.removeprefix(" ")
+        elif "event" in fields:
+            event_id = int(fields["id"]) if "id" in fields else None
+            yield LiveMessage(fields["event"], json.loads(fields["data"]), event_id)
+            fields = {}
+        else:
+            fields = {}

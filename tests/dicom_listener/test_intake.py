@@ -1,0 +1,195 @@
+"""From the inbox into the record, without a network: many frames, clocks, retention, damage."""
+
+import time
+from pathlib import Path
+
+import pytest
+from listener_room import SHARED, begin_hold, mr_data_set, needs_shared
+from mangled import mangled
+from pydicom import dcmread
+from pydicom.dataset import Dataset
+from pydicom.sequence import Sequence
+
+from case_record.record import CaseRecord
+from dicom_listener.clock import ClockRules
+from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope, sha256_of
+from dicom_listener.intake import Intake, IntakeRules, sync_clock
+from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.quirks import ENHANCED_MR_IMAGE
+from dicom_listener.usable import SliceRules
+
+
+class Desk:
+    """A record, an inbox and an intake in one folder."""
+
+    def __init__(self, folder: Path, **rules) -> None:
+        rules.setdefault("clock", ClockRules(prompt_delay_s=0.5))
+        self.record = CaseRecord(folder / "case", create=True)
+        self.inbox = Inbox(folder / "case" / "inbox")
+        self.folder = folder
+        self.intake = Intake(self.record, self.inbox, IntakeRules(**rules), ListenerMetrics())
+
+    def receive(self, data: Dataset | bytes, syntax: str = "1.2.840.10008.1.2.1", **changes):
+        """Store a data set as if it had just been sent, take it, and return its rows."""
+        body = data if isinstance(data, bytes) else self.encoded(data)
+        uid = "1.2.3" if isinstance(data, bytes) else str(data.SOPInstanceUID)
+        values = {
+            "calling_ae_title": "SCANNER",
+            "called_ae_title": "AUTOSPINE",
+            "peer_address": "127.0.0.1",
+            "peer_port": 104,
+            "received_s": time.time(),
+            "received_monotonic_s": time.monotonic(),
+            "transfer_syntax_uid": syntax,
+            "sop_class_uid": "1.2.840.10008.5.1.4.1.1.4",
+            "sop_instance_uid": uid,
+            "sha256": sha256_of(body),
+            "size_bytes": len(body),
+            **changes,
+        }
+        self.intake.take(self.inbox.store(body, Envelope(**values)))
+        return self.record.slices(sha256=values["sha256"])
+
+    def encoded(self, data_set: Dataset) -> bytes:
+        path = self.folder / "encoded.dcm"
+        data_set.save_as(path, enforce_file_format=True)
+        whole = path.read_bytes()
+        return whole[144 + int.from_bytes(whole[140:144], "little") :]
+
+    def alarms(self) -> list[str]:
+        return [e.body["alarm"] for e in self.record.events() if e.kind == "alarm"]
+
+
+@pytest.fixture
+def make_desk(tmp_path):
+    desks = []
+
+    def make(**rules) -> Desk:
+        desks.append(Desk(tmp_path, **rules))
+        return desks[-1]
+
+    yield make
+    for desk in desks:
+        desk.intake.close()
+        desk.record.close()
+
+
+def enhanced(n_frames: int, began_s: float) -> Dataset:
+    """An enhanced object whose frames are coronal slices 5 mm apart."""
+    data_set = mr_data_set("1.2.826.0.5", began_s=began_s)
+    data_set.SOPClassUID = ENHANCED_MR_IMAGE
+    data_set.file_meta.MediaStorageSOPClassUID = ENHANCED_MR_IMAGE
+    data_set.NumberOfFrames = n_frames
+    data_set.PixelData = data_set.PixelData * n_frames
+    frames = []
+    for k in range(n_frames):
+        frame, position = Dataset(), Dataset()
+        position.ImagePositionPatient = [-20, 10 + 5 * k, 24]
+        frame.PlanePositionSequence = Sequence([position])
+        frames.append(frame)
+    data_set.PerFrameFunctionalGroupsSequence = Sequence(frames)
+    return data_set
+
+
+def test_every_frame_of_one_object_is_a_slice_of_the_hold(make_desk):
+    desk = make_desk()
+    hold_id = begin_hold(desk.record, time.time() - 5, expected=2)
+    rows = desk.receive(enhanced(3, time.time() - 0.6))
+    assert [(row.frame, row.state) for row in rows] == [
+        (0, "assigned"),
+        (1, "assigned"),
+        (2, "pending"),  # one more than the hold expects
+    ]
+    assert {row.hold_id for row in rows} == {hold_id, None}
+    assert rows[1].header["geometry"]["position_mm"] == [-20, 15, 24]
+
+
+def test_a_stack_at_the_next_hold_must_lie_where_the_first_one_lay(make_desk):
+    desk = make_desk()
+    begin_hold(desk.record, time.time() - 5, expected=1)
+    desk.receive(mr_data_set("1.2.1", began_s=time.time() - 0.6))
+    desk.record.end_open_hold(time.time())
+    begin_hold(desk.record, time.time() + 0.1, expected=2)
+    time.sleep(1.3)
+    moved = mr_data_set("1.2.2", began_s=time.time() - 0.6)
+    moved.AcquisitionNumber = 2
+    moved.ImagePositionPatient = [-20, 12, 24]
+    assert desk.receive(moved)[0].reason_code == "geometry_differs_from_set"
+    same = mr_data_set("1.2.3.3", began_s=time.time() - 0.6)
+    same.AcquisitionNumber = 3
+    assert desk.receive(same)[0].state == "assigned"
+
+
+def test_a_data_set_with_another_uid_than_it_was_sent_under_is_set_aside(make_desk):
+    (row,) = make_desk().receive(mr_data_set("1.2.9"), sop_instance_uid="1.2.10")
+    assert row.reason_code == "uid_contradiction"
+
+
+def test_a_slice_without_any_uid_still_has_a_row(make_desk):
+    data_set = mr_data_set()
+    body = make_desk().encoded(data_set)
+    (row,) = make_desk().receive(body, sop_instance_uid="")
+    assert row.sop_instance_uid.startswith("none-")
+
+
+def test_an_explicit_sync_replaces_what_was_known_of_the_clock(make_desk):
+    desk = make_desk()
+    begin_hold(desk.record, time.time() - 60, expected=9)
+    hour_off = mr_data_set("1.2.1", began_s=time.time() - 3600.6)
+    assert desk.receive(hour_off)[0].reason_code == "clock_unknown"
+    with CaseRecord(desk.record.case_dir) as service:  # another connection, as in life
+        sync_clock(service, 3600.0, 0.5, "anna")
+    desk.intake.look_at_record()
+    again = mr_data_set("1.2.2", began_s=time.time() - 3600.6)
+    assert desk.receive(again)[0].state == "assigned"
+
+
+def test_set_aside_files_are_removed_after_their_retention_and_used_ones_never(make_desk):
+    desk = make_desk(retention_s=100.0)
+    begin_hold(desk.record, time.time() - 5)
+    (used,) = desk.receive(mr_data_set("1.2.1", began_s=time.time() - 0.6))
+    (aside,) = desk.receive(mr_data_set("1.2.2", began_s=time.time() - 500))
+    assert (used.state, aside.state) == ("assigned", "quarantined")
+    assert desk.intake.remove_old(time.time() + 50) == 0
+    assert desk.intake.remove_old(time.time() + 200) == 1
+    assert (desk.record.case_dir / used.path).exists()
+    assert not (desk.record.case_dir / aside.path).exists()
+    assert desk.record.events()[-1].kind == "files_removed"
+
+
+@needs_shared
+def test_a_file_on_which_the_codec_aborts_is_set_aside_and_the_next_is_taken(make_desk):
+    """The bytes of kept seed 2785: GDCM ends the process that decodes them."""
+    desk = make_desk(slices=SliceRules(coronal_tolerance_deg=None))
+    source = SHARED / "dicom2nifti/hdr/jpegll.dcm"
+    bad, jpeg_lossless = mangled(source.read_bytes(), 2785), "1.2.840.10008.1.2.4.70"
+    start = 144 + int.from_bytes(bad[140:144], "little")
+    uid = str(dcmread(source).SOPInstanceUID)
+    (row,) = desk.receive(bad[start:], jpeg_lossless, sop_instance_uid=uid)
+    assert row.reason_code == "undecodable_pixels"
+    good = source.read_bytes()
+    start = 144 + int.from_bytes(good[140:144], "little")
+    rows = desk.receive(good[start:], jpeg_lossless, sop_instance_uid=uid + ".1")
+    assert rows[0].reason_code != "undecodable_pixels"
+
+
+def test_a_file_that_is_not_ours_in_the_inbox_is_an_alarm_and_no_row(make_desk):
+    desk = make_desk()
+    stray = desk.inbox.folder / "stray.dcm"
+    mr_data_set().save_as(stray, enforce_file_format=True)
+    with pytest.raises(NotFromInboxError):
+        read_envelope(stray)
+    desk.intake.take(stray)
+    assert desk.record.slices() == []
+    assert desk.alarms() == ["foreign_file"]
+    assert desk.intake.left_over() == []
+
+
+def test_a_damaged_envelope_is_told_from_a_whole_one(make_desk):
+    desk = make_desk()
+    (row,) = desk.receive(mr_data_set())
+    path = desk.record.case_dir / row.path
+    whole = path.read_bytes()
+    path.write_bytes(whole[:150] + b"\xff" * 40 + whole[190:])
+    with pytest.raises(NotFromInboxError):
+        read_envelope(path)

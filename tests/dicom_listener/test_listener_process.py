@@ -1,0 +1,378 @@
+"""The whole listener as a process: from C-STORE to the row in the case record, through crashes."""
+
+import json
+import random
+import re
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import time
+import urllib.request
+from pathlib import Path
+
+import pytest
+from listener_room import (
+    ListenerProcess,
+    begin_hold,
+    listening,
+    mr_data_set,
+    wait_for,
+    write_room,
+)
+from pydicom.uid import ExplicitVRLittleEndian
+from pynetdicom import AE, evt
+from pynetdicom.association import Association
+
+from case_record.record import CaseRecord
+from dicom_listener.header import read_header
+from dicom_listener.inbox import is_whole, read_envelope
+from dicom_listener.intake import reassign, reset_clock
+from dicom_listener.pixels import magnitude_pixels
+from dicom_listener.process import run
+from dicom_listener.quirks import MR_IMAGE
+from dicom_listener.slice_rows import slice_from_record
+from room_config.load import ConfigError, load_config
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture
+def config(tmp_path):
+    return write_room(tmp_path)
+
+
+@pytest.fixture
+def record(config):
+    with CaseRecord(config.parent / "case", create=True) as opened:
+        yield opened
+
+
+def send(port: int, *data_sets) -> list[int]:
+    """Statuses of a C-STORE of each; -1 where no answer came."""
+    ae = AE("SCANNER")
+    ae.add_requested_context(MR_IMAGE, [ExplicitVRLittleEndian])
+    association = ae.associate("127.0.0.1", port, ae_title="AUTOSPINE")
+    assert association.is_established
+    statuses = [association.send_c_store(d).get("Status", -1) for d in data_sets]
+    association.release()
+    return statuses
+
+
+def rows(record: CaseRecord, count: int):
+    wait_for(lambda: len(record.slices()) >= count)
+    return record.slices()
+
+
+def alarms(record: CaseRecord) -> list[str]:
+    return [event.body["alarm"] for event in record.events() if event.kind == "alarm"]
+
+
+def test_a_slice_acquired_at_the_standing_hold_is_assigned_and_its_pixels_can_be_read(
+    config, record
+):
+    hold_id = begin_hold(record, time.time() - 5.0)
+    with listening(config) as listener:
+        assert send(listener.port, mr_data_set(began_s=time.time() - 0.6)) == [0]
+        (row,) = rows(record, 1)
+    assert (row.state, row.hold_id, row.reason_code) == ("assigned", hold_id, "")
+    assert row.time_source == "AcquisitionDateTime"
+    assert row.acquired_to_s <= row.received_s
+    path = record.case_dir / row.path
+    assert magnitude_pixels(path, row.frame).shape == (48, 40)
+    assert slice_from_record(row.header) == read_header(path)[0]
+    assert row.header["envelope"]["calling_ae_title"] == "SCANNER"
+    assert [event.kind for event in record.events()] == ["slice_received"]
+    record.verify_events()
+
+
+def test_with_no_case_open_slices_are_kept_and_recorded_as_without_a_hold(config):
+    with listening(config) as listener:
+        assert send(listener.port, mr_data_set()) == [0]
+        with CaseRecord(config.parent / "case") as record:
+            (row,) = rows(record, 1)
+            assert (row.state, row.reason_code) == ("quarantined", "no_open_hold")
+
+
+def test_the_same_slice_again_changes_nothing_and_other_bytes_under_its_uid_are_an_alarm(
+    config, record
+):
+    began_s = time.time() - 1
+    begin_hold(record, time.time() - 5.0, expected=3)
+    with listening(config) as listener:
+        first = mr_data_set("1.2.826.0.9", began_s=began_s)
+        send(listener.port, first, first)
+        wait_for(lambda: any(e.kind == "duplicate_slice" for e in record.events()))
+        assert len(record.slices()) == 1
+        assert len(list((record.case_dir / "inbox").glob("*.dcm"))) == 1
+        other = mr_data_set("1.2.826.0.9", began_s=began_s)
+        other.PixelData = bytes(reversed(other.PixelData))
+        send(listener.port, other)
+        first_row, second_row = rows(record, 2)
+    assert first_row.state == "assigned"
+    assert second_row.reason_code == "same_uid_other_bytes"
+    assert (record.case_dir / first_row.path).exists()
+    assert (record.case_dir / second_row.path).exists()
+    assert alarms(record) == ["same_uid_other_bytes"]
+
+
+def test_a_surplus_slice_waits_until_the_hold_expects_it(config, record):
+    hold_id = begin_hold(record, time.time() - 5.0, expected=1)
+    began_s = time.time() - 0.6
+    with listening(config) as listener:
+        send(listener.port, *(mr_data_set(f"1.2.9.{k}", began_s=began_s) for k in (1, 2, 3)))
+        states = [(row.state, row.reason_code) for row in rows(record, 3)]
+        assert states == [("assigned", "")] + [("pending", "not_expected")] * 2
+        record.expect_slices(hold_id, 2)
+        wait_for(lambda: record.slices()[1].state == "assigned")
+        assert record.slices()[2].state == "pending"
+        record.end_open_hold(time.time())
+        wait_for(lambda: record.slices()[2].state == "quarantined")
+    assert record.slices()[2].reason_code == "not_expected"
+
+
+def test_an_operator_may_overrule_and_who_is_recorded(config, record):
+    with listening(config) as listener:
+        send(listener.port, mr_data_set())
+        (row,) = rows(record, 1)
+        hold_id = begin_hold(record, time.time(), expected=1)
+        reassign(record, row.slice_id, hold_id, "anna", "the robot had not moved")
+        row = record.slice(row.slice_id)
+        assert (row.state, row.hold_id, row.decided_by) == ("assigned", hold_id, "anna")
+        assert record.events()[-1].who == "anna"
+        # the listener follows: the hold is full now
+        time.sleep(1.2)
+        send(listener.port, mr_data_set("1.2.77", began_s=time.time() - 0.6))
+        assert rows(record, 2)[1].reason_code == "not_expected"
+
+
+def test_a_scanner_clock_set_forward_is_an_alarm(config, record):
+    begin_hold(record, time.time() - 100.0, expected=9)
+    with listening(config) as listener:
+        send(listener.port, mr_data_set("1.2.1", began_s=time.time() - 40.6))
+        assert rows(record, 1)[0].state == "assigned"
+        send(listener.port, mr_data_set("1.2.2", began_s=time.time() - 0.6))
+        rows(record, 2)
+        wait_for(lambda: alarms(record) == ["clock_jump"])
+
+
+def test_a_scanner_clock_set_back_stops_assignment_until_it_is_reset(tmp_path):
+    config = write_room(tmp_path, late_limit_s=30.0)
+    with CaseRecord(tmp_path / "case", create=True) as record, listening(config) as listener:
+        begin_hold(record, time.time() - 5.0, expected=9)
+        send(listener.port, mr_data_set("1.2.1", began_s=time.time() - 0.6))
+        assert rows(record, 1)[0].state == "assigned"
+        send(listener.port, mr_data_set("1.2.2", began_s=time.time() - 60.6))
+        assert rows(record, 2)[1].reason_code == "late_or_clock_jump"
+        assert alarms(record) == ["late_or_clock_jump"]
+        reset_clock(record, "anna")
+        send(listener.port, mr_data_set("1.2.3", began_s=time.time() - 60.6))
+        assert rows(record, 3)[2].state == "assigned"
+
+
+def test_in_arrival_mode_a_confirmed_acquisition_needs_no_time(tmp_path):
+    config = write_room(tmp_path, arrival_mode=True)
+    with CaseRecord(tmp_path / "case", create=True) as record, listening(config) as listener:
+        hold_id = begin_hold(record, time.time() - 5.0)
+        timeless = mr_data_set()
+        del timeless.AcquisitionDateTime
+        send(listener.port, timeless)
+        assert rows(record, 1)[0].reason_code == "not_confirmed"
+        record.append_event(
+            "acquisition_confirmed", {"hold_id": hold_id}, source="service", who="anna"
+        )
+        wait_for(lambda: record.slices()[0].state == "assigned")
+        assert record.slices()[0].time_source == "arrival"
+
+
+def test_what_was_received_before_a_restart_keeps_its_meaning_after(config, record):
+    hold_id = begin_hold(record, time.time() - 5.0, expected=2)
+    with listening(config) as listener:
+        send(listener.port, mr_data_set("1.2.1", began_s=time.time() - 0.6))
+        rows(record, 1)
+    with listening(config) as listener:
+        first = mr_data_set("1.2.1", began_s=time.time() - 0.6)
+        send(listener.port, first, mr_data_set("1.2.2", began_s=time.time() - 0.6))
+        found = rows(record, 3)
+    assert [row.reason_code for row in found] == ["", "same_uid_other_bytes", ""]
+    assert [row.hold_id for row in found] == [hold_id, None, hold_id]
+
+
+def test_metrics_count_what_happened(tmp_path):
+    config = write_room(tmp_path, metrics_port=0)
+    with listening(config) as listener:
+        send(listener.port, mr_data_set())
+        url = f"http://127.0.0.1:{listener.ready['metrics_port']}/metrics"
+
+        def page() -> str:
+            with urllib.request.urlopen(url) as answer:
+                return answer.read().decode()
+
+        wait_for(lambda: 'reason="no_open_hold",state="quarantined"} 1.0' in page())
+        text = page()
+    assert "autospine_listener_slices_stored_total 1.0" in text
+    assert "autospine_listener_store_seconds_count 1.0" in text
+    assert re.search(r"autospine_listener_disk_free_bytes \d", text)
+
+
+def test_no_patient_is_in_the_log_or_in_the_record(config, record):
+    with listening(config) as listener:
+        send(listener.port, mr_data_set())
+        rows(record, 1)
+        log_file = listener.log
+    text = log_file.read_text()
+    for event in record.events():
+        text += json.dumps(event.body)
+    text += json.dumps(record.slices()[0].header)
+    assert "serving" in text
+    assert "Doe" not in text
+    assert "4711" not in text
+
+
+def run_listener(config: Path, *words: str) -> subprocess.CompletedProcess[str]:
+    command = [sys.executable, "-m", "dicom_listener.command_line", "--config", str(config), *words]
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
+
+
+def test_a_bad_configuration_ends_with_code_2_and_one_line(tmp_path):
+    ended = run_listener(write_room(tmp_path, prot=1))
+    assert ended.returncode == 2
+    assert "prot" in ended.stderr
+    assert len(ended.stderr.strip().splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("listener", "text"),
+    [
+        ({"peer_networks": ["10.0.0.0/99"]}, "10.0.0.0/99"),
+        ({"scanner_time_zone": "Mars/Olympus"}, "Mars/Olympus"),
+        (
+            {"tls_certificate": "a", "tls_key": "b", "tls_authority": "c"},
+            "certificates cannot be used",
+        ),
+        ({"tls_certificate": "a"}, "belong together"),
+        ({"max_associations": 0}, "max_associations"),
+    ],
+)
+def test_what_cannot_work_is_a_configuration_error_before_anything_is_served(
+    tmp_path, listener, text
+):
+    path = write_room(tmp_path, **listener)
+    with pytest.raises(ConfigError, match=text):
+        run(load_config(path, {}), threading.Event(), lambda ready: pytest.fail("served"))
+
+
+def test_a_port_in_use_ends_with_code_2_and_one_line(tmp_path, config):
+    with listening(config) as listener:
+        second = tmp_path / "second"
+        second.mkdir()
+        ended = run_listener(write_room(second, port=listener.port))
+        assert ended.returncode == 2
+        assert f"127.0.0.1:{listener.port}" in ended.stderr
+        assert len(ended.stderr.strip().splitlines()) == 1
+
+
+def test_check_tries_everything_once(config):
+    ended = run_listener(config, "--check")
+    assert ended.returncode == 0, ended.stdout + ended.stderr
+    assert re.findall(r"^ok +(\w+):", ended.stdout, re.M) == ["disk", "write", "clock", "echo"]
+
+
+def test_check_says_when_the_disk_is_low(tmp_path):
+    ended = run_listener(write_room(tmp_path, min_free_mib=10**9), "--check")
+    assert ended.returncode == 3
+    assert "FAIL disk" in ended.stdout
+
+
+def test_it_ends_when_its_parent_is_gone_and_on_sigterm(config):
+    listener = ListenerProcess(config)
+    assert listener.end() == 0
+    listener = ListenerProcess(config)
+    listener.process.send_signal(signal.SIGTERM)
+    assert listener.process.wait(10) == 0
+    listener.end()
+
+
+# Crashes
+
+
+class Sender(threading.Thread):
+    """Sends slices with content of their own until the peer dies; remembers what was answered."""
+
+    def __init__(self, port: int, name: str) -> None:
+        super().__init__()
+        self.port, self.prefix = port, name
+        self.answered: dict[str, bytes] = {}
+
+    def run(self) -> None:
+        ae = AE(f"S{self.prefix}"[:16])
+        ae.add_requested_context(MR_IMAGE, [ExplicitVRLittleEndian])
+        ae.dimse_timeout = 2
+        opened: list[socket.socket] = []  # pynetdicom leaves it open when the peer dies
+        remember = (evt.EVT_CONN_OPEN, lambda event: opened.append(event.assoc.dul.socket.socket))
+        association = ae.associate(
+            "127.0.0.1", self.port, ae_title="AUTOSPINE", evt_handlers=[remember]
+        )
+        try:
+            self.send_all(association)
+        finally:
+            for sock in opened:
+                sock.close()
+
+    def send_all(self, association: Association) -> None:
+        dice = random.Random(self.prefix)
+        number = 0
+        while association.is_established:
+            number += 1
+            uid = f"1.2.826.0.{self.prefix}.{number}"
+            data_set = mr_data_set(uid)
+            data_set.PixelData = dice.randbytes(48 * 40 * 2)
+            try:
+                status = association.send_c_store(data_set)
+            except (RuntimeError, ValueError):
+                return
+            if status.get("Status", -1) == 0:
+                self.answered[uid] = data_set.PixelData
+
+
+def crash_campaign(folder: Path, kills: int) -> None:
+    config = write_room(folder)
+    inbox = folder / "case" / "inbox"
+    dice = random.Random(20)
+    answered: dict[str, bytes] = {}
+    slowest_restart_s = 0.0
+    for kill in range(kills):
+        began_s = time.monotonic()
+        listener = ListenerProcess(config)
+        slowest_restart_s = max(slowest_restart_s, time.monotonic() - began_s)
+        senders = [Sender(listener.port, f"{kill + 1}.{n + 1}") for n in range(2)]
+        for sender in senders:
+            sender.start()
+        time.sleep(dice.uniform(0.1, 1.0))
+        listener.kill()
+        for sender in senders:
+            sender.join()
+            answered |= sender.answered
+    assert len(answered) > 5 * kills
+    with listening(config), CaseRecord(folder / "case") as record:
+        wait_for(lambda: {row.sop_instance_uid for row in record.slices()} >= answered.keys())
+        record.verify_events()
+        by_uid = {row.sop_instance_uid: record.case_dir / row.path for row in record.slices()}
+    for uid, pixels in answered.items():
+        assert is_whole(by_uid[uid])
+        assert by_uid[uid].read_bytes().endswith(pixels)
+    assert list(inbox.glob("*.part")) == []
+    for path in inbox.glob("*.dcm"):
+        assert is_whole(path)
+        assert read_envelope(path)[0].sop_instance_uid in by_uid
+    assert slowest_restart_s < 5.0
+
+
+def test_what_was_answered_success_survives_kill_9(tmp_path):
+    crash_campaign(tmp_path, kills=3)
+
+
+@pytest.mark.soak
+def test_what_was_answered_success_survives_twenty_kills(tmp_path):
+    crash_campaign(tmp_path, kills=20)

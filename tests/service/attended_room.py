@@ -1,0 +1,98 @@
+"""The processes of the virtual room for tests: nobody operates it but the test."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from service.children import autospine
+from service.client import RoomClient
+from service.state import RoomState
+from simulator.demo_room import DemoOptions, DemoRoom
+from simulator.truth_client import TruthAddress, ask_path
+
+Seen = TypeVar("Seen")
+
+
+class AttendedRoom(DemoRoom):
+    """The demo's room, but it asks before every approach move; `more` ends its file."""
+
+    def __init__(self, folder: Path, more: str = "") -> None:
+        super().__init__(DemoOptions(folder, seed=3, speed_factor=1.5))
+        self._more = more
+
+    def _write_config(self, ports: tuple[int, int]) -> Path:
+        path = super()._write_config(ports)
+        text = path.read_text().replace("confirm_moves = false", "confirm_moves = true")
+        path.write_text(text + self._more)
+        return path
+
+    def kill(self, name: str) -> None:
+        """As `kill -9` does."""
+        process = self.family.children[name].process
+        process.kill()
+        process.wait(5.0)
+
+    def start_again(self, name: str) -> None:
+        self.family.children[name].end()
+        words = autospine(name, "--config", str(self.folder / "room.toml"))
+        self.family.start(name, words)
+
+    def start_bridge_again(self) -> None:
+        self.family.children["bridge"].end()
+        here = ["--config", str(self.folder / "room.toml")]
+        self.family.launch("bridge", [sys.executable, "-m", "robot_bridge", *here])
+
+    def standstill_s(self, from_s: float, until_s: float) -> float:
+        """The instant of the last motion of any stage, as the motors know it."""
+        path = ask_path(TruthAddress("127.0.0.1", self.truth_port), from_s, until_s)
+        steps = np.any(np.abs(np.diff(path.positions_mm, axis=0)) > 0, axis=1)
+        moved_s = path.times_s[1:][steps]
+        return float(moved_s[-1]) if len(moved_s) else from_s
+
+
+@contextmanager
+def running_room(folder: Path, more: str = "") -> Iterator[AttendedRoom]:
+    room = AttendedRoom(folder, more)
+    try:
+        room.start()
+        yield room
+    finally:
+        room.end()
+
+
+def wait_for(
+    look: Callable[[], Seen], wanted: Callable[[Seen], object], timeout_s: float = 60.0
+) -> Seen:
+    """Look until it is as wanted; the last look is in the error."""
+    deadline_s = time.monotonic() + timeout_s
+    while True:
+        seen = look()
+        if wanted(seen):
+            return seen
+        assert time.monotonic() < deadline_s, f"after {timeout_s:.0f} s still {seen}"
+        time.sleep(0.02)
+
+
+def arm(client: RoomClient) -> None:
+    """Link, arm, and wait until the state says so."""
+    state = wait_for(client.state, lambda s: s.robot.linked and not s.robot.moving)
+    if state.robot.stopped or not state.robot.armed or not state.robot.position_certain:
+        client.reset()
+    wait_for(client.state, lambda s: s.robot.armed and not s.robot.stopped)
+
+
+def calibrated(client: RoomClient) -> RoomState:
+    """The state of a room that has been calibrated, if need be now."""
+    arm(client)
+    state = client.state()
+    if not state.calibrated:
+        client.start_calibration()
+        state = wait_for(client.state, lambda s: s.calibrated and s.procedure is None, 120.0)
+    return state

@@ -1,0 +1,49 @@
+"""`autospine service` as a process of its own, without robot, listener and worker."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from service.children import autospine
+
+# a serial device on which nobody answers; both ends stay open as long as the tests run
+_FAR_END, _NEAR_END = os.openpty()
+
+CONFIG = f"""
+[room]
+name = "lone room"
+case_dir = "case"
+virtual = true
+
+[service]
+port = 0
+bridge_link = "{os.ttyname(_NEAR_END)}"
+"""
+
+
+@contextmanager
+def running_service(folder: Path, more: str = "") -> Iterator[str]:
+    """The URL of a service whose `[service]` table goes on with `more`."""
+    config = folder / "room.toml"
+    config.write_text(CONFIG + more)
+    log = folder / "service.log"
+    with log.open("wb") as errors:
+        process = subprocess.Popen(
+            [*autospine("service", "--config", str(config)), "--exit-with-parent"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            stderr=errors,
+        )
+    try:
+        assert process.stdout is not None
+        line = process.stdout.readline()
+        assert line, log.read_text()
+        yield str(json.loads(line)["url"])
+    finally:
+        process.communicate()
+        assert process.returncode == 0, log.read_text()

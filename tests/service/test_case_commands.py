@@ -1,0 +1,189 @@
+"""replay, export and report of a case that was really recorded (offline room, real DICOM files)."""
+
+import hashlib
+import json
+import shutil
+import sqlite3
+import subprocess
+import sys
+import zipfile
+from pathlib import Path
+
+import pydicom
+import pytest
+from offline_arguments import approach_arguments, beside, calibration_arguments
+
+from case_record.record import FILE_NAME, CaseRecord
+from service.procedures import (
+    APPROACH,
+    CALIBRATION,
+)
+from service.procedures import (
+    approach_arguments as approach_json,
+)
+from service.procedures import (
+    calibration_arguments as calibration_json,
+)
+from service.sensing import ProcedureFailedError
+from simulator.config import VirtualRoom
+from simulator.stage_physics import StageParameters
+from sr_engine.shiftset import named
+from studies.offline_room import MrImaging
+from studies.recorded_room import RecordedRoom
+
+AUTOSPINE = Path(sys.executable).parent / "autospine"
+
+
+def autospine(*words):
+    return subprocess.run([AUTOSPINE, *words], capture_output=True, text=True, timeout=120)
+
+
+@pytest.fixture(scope="module")
+def case(tmp_path_factory):
+    """A calibration with commanded shifts, an approach that is READY, one out of reach."""
+    folder = tmp_path_factory.mktemp("cases") / "phantom"
+    with CaseRecord(folder, create=True) as record:
+        room = RecordedRoom(record, MrImaging(VirtualRoom()), StageParameters(), 2)
+        shifts = named("quarter").shifts_px
+        calibration = room.run_recorded(
+            CALIBRATION, calibration_json(calibration_arguments(shifts_px=shifts))
+        )
+        target = beside(calibration, 2.0, -3.0)
+        patient = [float(target[1]), 58.0, -float(target[0])]
+        record.append_event("target_set", {"patient_mm": patient}, source="test", who="operator")
+        arguments = approach_arguments(target, confirm_moves=False)
+        arrival = room.run_recorded(APPROACH, approach_json(arguments, calibration))
+        record.append_event("puncture", {"procedure_id": 2}, source="test", who="<b>operator</b>")
+        away = approach_arguments(beside(calibration, 60.0, 0.0), confirm_moves=False)
+        with pytest.raises(ProcedureFailedError):
+            room.run_recorded(APPROACH, approach_json(away, arrival.calibration))
+    return folder
+
+
+def test_replay_takes_the_recorded_steps_and_measures_the_same_to_the_last_bit(case):
+    ended = autospine("replay", case, "--json")
+    assert ended.returncode == 0, ended.stderr
+    found = json.loads(ended.stdout)
+    assert [row["name"] for row in found["procedures"]] == [CALIBRATION, APPROACH, APPROACH]
+    assert all(row["agrees"] for row in found["procedures"])
+    assert len(found["measurements"]) >= 6
+    assert all(row["difference_mm"] == 0.0 for row in found["measurements"])
+
+
+def test_replay_with_another_method_says_what_it_would_have_said(case):
+    found = json.loads(autospine("replay", case, "--method", "sr", "--json").stdout)
+    rows = [row for row in found["measurements"] if row["replayed_mm"]]
+    assert rows
+    assert all(row["method"] == "sr" for row in rows)
+    assert 0.0 < max(row["difference_mm"] for row in rows) < 0.7
+    sets = [row for row in rows if row["frames"] == 4]
+    assert sets
+    single = [row for row in found["measurements"] if row["frames"] == 1]
+    assert all(row["reason"] or row["difference_mm"] is not None for row in single)
+
+
+def test_replay_changes_nothing(case):
+    with CaseRecord(case) as record:
+        before = (record.last_event_id(), len(record.measurements()), len(record.holds()))
+    autospine("replay", case)
+    with CaseRecord(case) as record:
+        after = (record.last_event_id(), len(record.measurements()), len(record.holds()))
+    assert after == before
+
+
+def test_a_procedure_that_would_now_take_other_steps_is_told(case, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(case, copy)
+    db = sqlite3.connect(copy / FILE_NAME)
+    body = json.loads(
+        db.execute("SELECT body FROM step WHERE procedure_id = 2 AND kind = 'MoveTo'").fetchone()[0]
+    )
+    body["setpoints_um"]["xt"] += 500
+    db.execute(
+        "UPDATE step SET body = ? WHERE procedure_id = 2 AND kind = 'MoveTo'", (json.dumps(body),)
+    )
+    db.commit()
+    db.close()
+    ended = autospine("replay", copy, "--json")
+    assert ended.returncode == 3
+    assert not json.loads(ended.stdout)["procedures"][1]["agrees"]
+
+
+def test_export_holds_every_file_as_received_and_every_row(case, tmp_path):
+    target = tmp_path / "case.zip"
+    assert autospine("export", case, "--out", target).returncode == 0
+    with zipfile.ZipFile(target) as archive, CaseRecord(case) as record:
+        manifest = json.loads(archive.read("MANIFEST.json"))
+        for name, digest in manifest["sha256"].items():
+            assert hashlib.sha256(archive.read(name)).hexdigest() == digest
+        assert set(manifest["sha256"]) == set(archive.namelist()) - {"MANIFEST.json"}
+        assert manifest["missing"] == []
+        rows = [json.loads(line) for line in archive.read("slices.jsonl").splitlines()]
+        assert [row["sha256"] for row in rows] == [row.sha256 for row in record.slices()]
+        for row in rows:
+            content = archive.read("dicom/" + Path(row["path"]).name)
+            assert hashlib.sha256(content).hexdigest() == row["sha256"]
+        events = [json.loads(line) for line in archive.read("events.jsonl").splitlines()]
+        assert len(events) == record.last_event_id()
+        assert "images/measurement-5.png" in archive.namelist()
+        archive.extract("dicom/0001.dcm", tmp_path)
+    assert pydicom.dcmread(tmp_path / "dicom" / "0001.dcm").Rows == 128
+
+
+def test_export_does_not_overwrite_unless_told(case, tmp_path):
+    target = tmp_path / "case.zip"
+    target.write_text("something dear")
+    ended = autospine("export", case, "--out", target)
+    assert (ended.returncode, target.read_text()) == (2, "something dear")
+    assert "--force" in ended.stderr
+    assert autospine("export", case, "--out", target, "--force").returncode == 0
+    assert zipfile.is_zipfile(target)
+
+
+def test_export_says_which_file_is_gone(case, tmp_path):
+    copy = tmp_path / "copy"
+    shutil.copytree(case, copy)
+    (copy / "inbox" / "0002.dcm").unlink()
+    target = tmp_path / "case.zip"
+    assert autospine("export", copy, "--out", target).returncode == 0
+    with zipfile.ZipFile(target) as archive:
+        assert json.loads(archive.read("MANIFEST.json"))["missing"] == ["inbox/0002.dcm"]
+
+
+def test_report_is_one_page_that_loads_nothing_and_escapes_what_people_wrote(case, tmp_path):
+    target = tmp_path / "report.html"
+    assert autospine("report", case, "--out", target).returncode == 0
+    page = target.read_text(encoding="utf-8")
+    for heading in ("Approaches", "Calibrations", "Distance to the target", "Measurements"):
+        assert f"<h2>{heading}</h2>" in page
+    assert page.count("data:image/png;base64,") >= 2
+    assert "http://" not in page
+    assert "https://" not in page
+    assert "<b>operator</b>" not in page
+    assert "outside its travel" in page
+
+
+@pytest.mark.parametrize("command", ["replay", "export", "report"])
+def test_a_folder_without_a_case_or_from_a_newer_version_is_refused_in_one_line(
+    command, tmp_path, case
+):
+    ended = autospine(command, tmp_path)
+    assert ended.returncode == 2
+    assert "no case record" in ended.stderr
+    newer = tmp_path / "newer"
+    shutil.copytree(case, newer)
+    db = sqlite3.connect(newer / FILE_NAME)
+    db.execute("PRAGMA user_version = 99")
+    db.close()
+    ended = autospine(command, newer)
+    assert ended.returncode == 2
+    assert "schema version 99, newer than" in ended.stderr
+    assert len(ended.stderr.strip().splitlines()) == 1
+
+
+def test_replay_refuses_a_method_that_does_not_exist(case):
+    ended = autospine("replay", case, "--method", "magic")
+    assert (ended.returncode, ended.stderr.strip()) == (
+        2,
+        "autospine: no method 'magic'; known: ml, base, bicubic, sr",
+    )

@@ -1,0 +1,335 @@
+"""A real Chromium on the page, against the real processes of the virtual room."""
+
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import httpx
+import pytest
+from attended_room import AttendedRoom, arm, calibrated, running_room, wait_for
+from browser import Complaints, running_browser
+from playwright.sync_api import Browser, Page, expect
+
+from service.access import new_token, token_hash
+from service.client import RefusedByServiceError, RoomClient
+
+AXE = Path(__file__).parent / "vendored" / "axe.min.js"
+SLOW_MS = 60_000
+STOP_LIMIT_S = 0.5
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    with running_browser() as running:
+        yield running
+
+
+@pytest.fixture
+def page(browser: Browser, room: AttendedRoom) -> Iterator[Page]:
+    complaints = Complaints()
+    page = browser.new_page(viewport={"width": 1280, "height": 800})
+    complaints.watch(page)
+    page.goto(room.url)
+    expect(page.locator("#phases [aria-current]")).to_be_visible()
+    yield page
+    page.close()
+    assert not complaints
+
+
+def button(page: Page, words: str) -> None:
+    """Click a button as soon as it may be clicked."""
+    page.get_by_role("button", name=words, exact=True).click(timeout=SLOW_MS)
+
+
+def ready_to_calibrate(page: Page, client: RoomClient) -> None:
+    state = client.state()
+    if state.ready:
+        client.needle_out()
+    if not client.state().robot.armed or client.state().robot.stopped:
+        page.get_by_role("button", name=re.compile("^(Arm|Re-arm) the robot$")).click(
+            timeout=SLOW_MS
+        )
+    expect(page.locator("#chips")).to_contain_text("Armed", timeout=SLOW_MS)
+
+
+def pick_target(page: Page, client: RoomClient, row_mm: float, col_mm: float) -> None:
+    """Click on the slice so far from where the fiducial is, and set the target there."""
+    state = client.state()
+    assert state.slice is not None
+    assert state.measurement is not None
+    assert state.measurement.centre_px is not None
+    row, col = state.measurement.centre_px
+    between_rows, between_cols = state.slice.spacing_mm
+    page.get_by_role("button", name="Pick target").click()
+    canvas = page.locator(".view canvas").first
+    box = canvas.bounding_box()
+    assert box is not None
+    rows, cols = state.slice.shape
+    x = box["x"] + (col + col_mm / between_cols + 0.5) * box["width"] / cols
+    y = box["y"] + (row + row_mm / between_rows + 0.5) * box["height"] / rows
+    page.mouse.click(x, y)
+    button(page, "Set target")
+
+
+def test_a_whole_case_from_calibration_to_the_needle_out_by_clicking(
+    page: Page, client: RoomClient
+) -> None:
+    ready_to_calibrate(page, client)
+    button(page, "Start the calibration")
+    expect(page.locator("#prompt")).to_contain_text("Set a target", timeout=2 * SLOW_MS)
+    pick_target(page, client, 2.5, -3.0)
+    target = wait_for(client.state, lambda s: s.target_patient_mm is not None).target_patient_mm
+    measured = client.state().measurement
+    assert target is not None
+    assert measured is not None
+    assert measured.patient_mm is not None
+    # rows grow towards the feet, columns towards the left; a click is exact to a pixel of screen
+    moved = [a - b for a, b in zip(target, measured.patient_mm, strict=True)]
+    assert moved == pytest.approx([-3.0, 0.0, -2.5], abs=0.5)
+    button(page, "Start the approach")
+    prompt = page.locator("#prompt")
+    confirm, ready = page.locator("#confirm"), page.locator("#prompt.ready")
+    for _ in range(9):
+        expect(confirm.or_(ready)).to_be_visible(timeout=SLOW_MS)
+        if ready.is_visible():
+            break
+        assert "mm" in page.locator("#question").inner_text()
+        confirm.click()
+        expect(confirm).to_have_count(0, timeout=SLOW_MS)
+    expect(prompt).to_contain_text("READY", timeout=SLOW_MS)
+    arrival = client.state().arrival
+    assert arrival is not None
+    assert arrival.error_mm < client.state().tolerance_mm
+    expect(page.locator("#error-body .big")).to_contain_text(f"{arrival.error_mm:.3f}")
+    expect(page.locator("#chips")).to_contain_text("Motion locked", timeout=SLOW_MS)
+    button(page, "Record the puncture")
+    page.locator("#depth").fill("61.5")
+    button(page, "Record the puncture")
+    button(page, "The needle is out: unlock")
+    expect(page.locator("#chips")).not_to_contain_text("Motion locked", timeout=SLOW_MS)
+    events = {event.kind: event for event in client.events()}
+    assert events["puncture"].body["insertion_depth_mm"] == 61.5
+    assert events["puncture"].who == "operator"
+    expect(page.locator("#events")).to_contain_text("Needle out")
+
+
+def test_the_overlay_shows_the_fiducial_where_it_was_measured(
+    page: Page, client: RoomClient
+) -> None:
+    calibrated(client)
+    state = client.state()
+    assert state.slice is not None
+    assert state.measurement is not None
+    assert state.measurement.patient_mm is not None
+    circle = page.locator("#fiducial")
+    expect(circle).to_have_attribute("cx", re.compile(r"\d"))
+    slice_ = state.slice
+    from_first = [
+        a - b for a, b in zip(state.measurement.patient_mm, slice_.position_mm, strict=True)
+    ]
+    for name, direction in (("cx", slice_.col_direction), ("cy", slice_.row_direction)):
+        wanted = sum(a * b for a, b in zip(from_first, direction, strict=True))
+        assert float(circle.get_attribute(name) or "nan") == pytest.approx(wanted, abs=1e-6)
+    letters = [page.locator(f".view >> nth=0 >> .side.{s}").inner_text() for s in SIDES]
+    assert letters == ["H", "F", "R", "L"]
+
+
+SIDES = ("top", "bottom", "left", "right")
+
+
+@pytest.mark.parametrize("how", ["mouse", "key"])
+def test_stop_during_motion_stands_still_within_half_a_second_of_the_click(
+    page: Page, client: RoomClient, room: AttendedRoom, how: str
+) -> None:
+    arm(client)
+    page.evaluate(
+        """() => { for (const kind of ["click", "keydown"]) addEventListener(kind, (event) => {
+            if (event.key === "Escape" || event.target.id === "stop") window.pressed = Date.now();
+        }, {capture: true}); }"""
+    )
+    client.start_calibration()
+    # the second move of a calibration is 15 mm long: the stages are under way for seconds
+    wait_for(client.state, lambda s: "2/4" in s.prompt and s.robot.positions_um["xt"] > 1000)
+    if how == "mouse":
+        page.locator("#stop").click()
+    else:
+        page.keyboard.press("Escape")
+    pressed_s = page.evaluate("window.pressed") / 1000
+    stopped = wait_for(client.state, lambda s: s.robot.stopped and not s.robot.moving)
+    time.sleep(0.5)
+    took_s = room.standstill_s(pressed_s - 1.0, time.time()) - pressed_s
+    assert 0.0 < took_s < STOP_LIMIT_S, "the stages did not move any more, or for too long"
+    print(f"{how}: click to standstill {1000 * took_s:.0f} ms")
+    assert stopped.robot.stopped
+    expect(page.locator("#phases [aria-current]")).to_have_text("Stop")
+    expect(page.locator("#alarms")).to_contain_text("stopped")
+    wait_for(client.state, lambda s: s.procedure is None)
+    assert client.events()[-1].kind in ("procedure_aborted", "stop", "move_ended")
+    arm(client)
+
+
+def ask_for_a_move(client: RoomClient) -> None:
+    """Until a move waits for its confirmation."""
+    measured = calibrated(client).measurement
+    assert measured is not None
+    assert measured.patient_mm is not None
+    x, y, z = measured.patient_mm
+    client.set_target((x - 2.0, y, z + 2.0))
+    client.start_approach()
+    wait_for(client.state, lambda s: s.question is not None)
+
+
+def test_a_confirmation_that_comes_second_is_refused_and_says_why(
+    page: Page, browser: Browser, room: AttendedRoom, client: RoomClient
+) -> None:
+    ask_for_a_move(client)
+    second = browser.new_page()
+    second.goto(room.url)
+    for screen in (page, second):
+        expect(screen.locator("#confirm")).to_be_enabled(timeout=SLOW_MS)
+    # the second operator's screen hangs: it still shows the question when it is answered
+    second.evaluate("window.hang = document.getElementById('confirm')")
+    page.locator("#confirm").click()
+    wait_for(client.state, lambda s: s.question is None)
+    second.evaluate("window.hang.click()")
+    expect(second.locator("#refusal")).to_contain_text("not open any more")
+    second.close()
+    state = client.state()
+    assert sum(event.kind == "answered" for event in client.events(after=state.event_id - 40)) == 1
+    client.stop()
+    arm(client)
+
+
+def test_a_viewer_sees_everything_and_can_move_nothing(browser: Browser, tmp_path: Path) -> None:
+    viewer, operator = new_token(), new_token()
+    tables = "".join(
+        f'\n[[service.token]]\nname = "{name}"\nrole = "{role}"\nsha256 = "{token_hash(token)}"\n'
+        for name, role, token in (("Vera", "viewer", viewer), ("Otto", "operator", operator))
+    )
+    with running_room(tmp_path, tables) as guarded:
+        page = browser.new_page()
+        page.goto(guarded.url)
+        page.locator("#token").fill("wrong")
+        button(page, "Log in")
+        expect(page.locator("#login-refusal")).to_contain_text("not known")
+        page.locator("#token").fill(viewer)
+        button(page, "Log in")
+        expect(page.locator("#who")).to_have_text("Vera (viewer)")
+        with RoomClient(guarded.url, token=operator) as otto:
+            arm(otto)
+            before = otto.state().robot.positions_um
+            start = page.get_by_role("button", name="Start the calibration")
+            expect(start).to_be_visible()
+            expect(start).to_be_disabled()
+            expect(page.locator("#pick")).to_be_disabled()
+            status = page.evaluate(
+                """async () => (await fetch("/api/v1/calibration", {method: "POST", body: "{}",
+                   headers: {"Content-Type": "application/json"}})).status"""
+            )
+            assert status == 403
+            assert otto.state().robot.positions_um == before
+            page.locator("#stop").click()
+            wait_for(otto.state, lambda s: s.robot.stopped)
+            assert [e.who for e in otto.events() if e.kind == "stop"] == ["Vera"]
+            with (
+                RoomClient(guarded.url, token=viewer) as vera,
+                pytest.raises(RefusedByServiceError, match="viewer"),
+            ):
+                vera.reset()
+        page.close()
+
+
+@pytest.mark.parametrize("theme", ["dark", "light"])
+def test_axe_finds_no_serious_violation(page: Page, client: RoomClient, theme: str) -> None:
+    calibrated(client)
+    page.evaluate(f"document.documentElement.dataset.theme = '{theme}'")
+    expect(page.locator("#aside")).not_to_be_empty()
+    # the page's own policy forbids foreign scripts, as it should: axe comes in through the debugger
+    page.evaluate(AXE.read_text(encoding="utf-8") + "; null")
+    found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
+    serious = [
+        f"{v['id']}: {v['nodes'][0]['html'][:120]} {v['nodes'][0].get('failureSummary', '')[:300]}"
+        for v in found["violations"]
+        if v["impact"] in ("serious", "critical")
+    ]
+    assert not serious, "\n".join(serious)
+
+
+@pytest.mark.parametrize(("width", "height"), [(1280, 800), (3840, 2160), (820, 1180), (1024, 768)])
+def test_stop_and_the_next_step_are_on_the_screen_at_every_size(
+    page: Page, width: int, height: int
+) -> None:
+    page.set_viewport_size({"width": width, "height": height})
+    page.wait_for_timeout(200)
+    for name, least in (("#stop", 44), ("#prompt", 10)):
+        box = page.locator(name).bounding_box()
+        assert box is not None
+        assert box["height"] >= least
+        assert box["x"] >= 0
+        assert box["x"] + box["width"] <= width
+        if name == "#stop":
+            assert box["y"] + box["height"] <= height
+    assert page.evaluate("document.documentElement.scrollWidth") <= width
+
+
+def test_the_page_is_light_and_asks_nobody_but_its_own_service(
+    browser: Browser, room: AttendedRoom
+) -> None:
+    page = browser.new_page()
+    fetched: dict[str, int] = {}
+    hosts = set()
+
+    def note(answer: httpx.Response) -> None:
+        hosts.add(answer.url.split("/")[2])
+        if "/page/" in answer.url or answer.url.rstrip("/") == room.url:
+            fetched[answer.url] = len(answer.body())
+
+    page.on("response", note)
+    page.goto(room.url, wait_until="load")
+    expect(page.locator("#phases [aria-current]")).to_be_visible()
+    assert len(fetched) > 10
+    assert sum(fetched.values()) < 300_000
+    assert hosts == {room.url.removeprefix("http://")}
+    page.close()
+
+
+@pytest.mark.parametrize("name", ["worker", "listener"])
+def test_the_loss_and_return_of_a_process_are_shown(
+    page: Page, room: AttendedRoom, name: str
+) -> None:
+    lamp = page.locator("#lights li", has_text=name.capitalize())
+    expect(lamp).to_have_class("up", timeout=SLOW_MS)
+    room.kill(name)
+    expect(lamp).to_have_class("down", timeout=3000)
+    expect(page.locator("#alarms")).to_contain_text(f"The {name} has ended")
+    room.start_again(name)
+    expect(lamp).to_have_class("up", timeout=SLOW_MS)
+    expect(page.locator("#alarms")).not_to_contain_text(f"The {name} has ended")
+
+
+def test_the_loss_and_return_of_the_bridge_are_shown(page: Page, room: AttendedRoom) -> None:
+    lamp = page.locator("#lights li", has_text="Robot")
+    room.kill("bridge")
+    expect(lamp).to_have_class("down", timeout=SLOW_MS)
+    expect(page.locator("#prompt")).to_contain_text("No link to the robot")
+    room.start_bridge_again()
+    expect(lamp).to_have_class("up", timeout=SLOW_MS)
+    expect(page.locator("#actions")).to_contain_text("the robot")
+
+
+def test_the_loss_of_the_service_greys_the_page_at_once_and_its_return_revives_it(
+    browser: Browser, room: AttendedRoom
+) -> None:
+    page = browser.new_page()
+    page.goto(room.url)
+    expect(page.locator("#phases [aria-current]")).to_be_visible()
+    room.kill("service")
+    expect(page.locator("body")).to_have_class("stale", timeout=3000)
+    expect(page.locator("#banner-lost")).to_contain_text("Connection lost")
+    page.locator("#stop").click()
+    expect(page.locator("#refusal")).to_contain_text("stop switch at the robot")
+    room.start_again("service")
+    expect(page.locator("body")).not_to_have_class("stale", timeout=SLOW_MS)
+    expect(page.locator("#banner-lost")).to_be_hidden()
+    page.close()
