@@ -162,7 +162,7 @@ def decisions_ms(case_dir: Path) -> list[float]:
     with CaseRecord(case_dir) as record:
         for procedure in record.procedures():
             steps = record.steps(procedure.procedure_id)
-            for before, step, after in zip(steps, steps[1:], [*steps[2:], None], strict=True):
+            for before, step, after in zip(steps, steps[1:], [*steps[2:], None], strict=False):
                 if (before.kind, step.kind) != ("Acquire", "Measure") or step.outcome is None:
                     continue
                 decided_s = after.sent_s if after else procedure.ended_s

@@ -14,6 +14,7 @@ from robot_bridge.emulator_axis import EmulatedController
 from robot_bridge.emulator_commands import Answer, execute, failed, status_error
 from robot_bridge.emulator_switches import LineFaults, Switches
 from robot_bridge.pmd_protocol import BROADCAST_ADDRESS
+from robot_bridge.pmd_status import Status
 
 BYTE_S = 10 / 115200  # start bit, eight data bits, stop bit
 PARTIAL_LINE_TIMEOUT_S = 0.3
@@ -35,12 +36,13 @@ class EmulatedBus:
         self.switches = switches
         self.faults = LineFaults()
         self.lines_received = 0
+        self.collisions = 0
         self._rng = rng
         self._line = bytearray()
         self._cancelled = False
         self._last_byte_s = 0.0
         self._line_free_s = 0.0
-        self._outbox: list[tuple[float, int, bytes]] = []
+        self._outbox: list[tuple[float, int, float, bytes]] = []  # ends, number, begins, bytes
         self._sent = 0
 
     # Time
@@ -65,7 +67,7 @@ class EmulatedBus:
     def take_output(self, now_s: float) -> bytes:
         due = bytearray()
         while self._outbox and self._outbox[0][0] <= now_s:
-            due += heapq.heappop(self._outbox)[2]
+            due += heapq.heappop(self._outbox)[3]
         return bytes(due)
 
     def next_output_s(self) -> float | None:
@@ -75,11 +77,23 @@ class EmulatedBus:
 
     def receive(self, data: bytes, now_s: float) -> None:
         self.advance(now_s)
+        if self.switches.collisions == "lost" and self._collides(now_s):
+            return
         if self.switches.own_echo:
             self._send(data, now_s)
         self._last_byte_s = now_s
         for byte in data:
             self._receive_byte(byte, now_s)
+
+    def _collides(self, now_s: float) -> bool:
+        """Half duplex: two talk at once, and nobody is understood."""
+        answering = any(begins_s <= now_s < ends_s for ends_s, _, begins_s, _ in self._outbox)
+        if answering:
+            self.collisions += 1
+            self._outbox.clear()
+            for controller in self.controllers:
+                controller.latched |= Status.COM_ERROR
+        return answering
 
     def _receive_byte(self, byte: int, now_s: float) -> None:
         if byte in (CR, LF, SEMICOLON):
@@ -196,4 +210,4 @@ class EmulatedBus:
         begins_s = max(not_before_s, self._line_free_s)
         self._line_free_s = begins_s + len(data) * BYTE_S
         self._sent += 1
-        heapq.heappush(self._outbox, (self._line_free_s, self._sent, data))
+        heapq.heappush(self._outbox, (self._line_free_s, self._sent, begins_s, data))

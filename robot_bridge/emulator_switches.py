@@ -23,6 +23,8 @@ class Switches:
     overspeed: Literal["clamp", "refuse"] = "clamp"
     target_beyond_limit: Literal["stop_there", "refuse"] = "stop_there"
     broadcast_stop: bool = True
+    # "lost": what the host says while a controller answers is lost, and so is the answer.
+    collisions: Literal["ignored", "lost"] = "ignored"
     bare_status: bool = True  # `U` without a digit means `U0`
     encoder_type_description: bool = True  # `Y13:1, Quad_32`
 

@@ -1,9 +1,9 @@
 """A second process that stops the motors when the daemon cannot: killed, crashed hard, frozen.
 
-It is forked before any port is opened and knows the ports by name. The daemon writes a byte into a
-pipe every turn of its loop; when the pipe closes without a farewell, or stays silent, the guardian
-opens the ports itself and sends the stop bytes. It ignores terminal signals and has its own
-session, so what kills the daemon's group by mistake spares it.
+It is forked before any port is opened and knows the ports by name. The daemon's loop writes a byte
+into a pipe twenty times a second; when the pipe closes without a farewell, or stays silent, the
+guardian opens the ports itself and sends the stop bytes. It ignores terminal signals and has its
+own session, so what kills the daemon's group by mistake spares it.
 """
 
 import contextlib
@@ -20,6 +20,7 @@ import serial
 _BEAT, _FAREWELL = b"b", b"x"
 _PAUSE_S = 0.004  # a controller answers within 2 ms; never talk into its answer
 _ROUNDS = 2
+BEAT_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -45,8 +46,14 @@ class Guardian:
             os._exit(0)
         os.close(read_end)
         self._lost = False
+        self._beaten_s = 0.0
 
     def beat(self) -> None:
+        """Call every turn of the loop."""
+        now_s = time.monotonic()
+        if now_s - self._beaten_s < BEAT_S:
+            return
+        self._beaten_s = now_s
         with contextlib.suppress(OSError):
             os.write(self._write_end, _BEAT)
 

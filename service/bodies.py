@@ -63,6 +63,13 @@ class CaseBody(Ask):
     note: str = Field(default="", max_length=2000)
 
 
+class ClockBody(Ask):
+    """A comparison of the two clocks, made now: the room's minus the scanner's."""
+
+    offset_s: float = Field(ge=-86_400 * 366, le=86_400 * 366, examples=[-37.2])
+    uncertainty_s: float = Field(gt=0, le=60, examples=[0.5])
+
+
 class AssignmentBody(Ask):
     """Overrule the listener: the slice belongs to this hold, or (null) to none."""
 

@@ -120,7 +120,7 @@ def learn_from_move(
         for axis in jacobian.axes
     }
     scatter = max(noise.variance_mm2(change_mm[axis]) for axis in jacobian.axes)
-    noise_mm2 = before.covariance_mm2 + after.covariance_mm2 + np.eye(2) * scatter
+    noise_mm2 = before.covariance_mm2 + after.covariance_mm2 + np.eye(len(jacobian.axes)) * scatter
     return jacobian.updated(change_mm, after.plane_mm - before.plane_mm, noise_mm2)
 
 

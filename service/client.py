@@ -155,8 +155,15 @@ class RoomClient:
     def record_puncture(self, insertion_depth_mm: float | None = None) -> None:
         self._order("POST", "/api/v1/puncture", insertion_depth_mm=insertion_depth_mm)
 
+    def lock_motion(self) -> None:
+        self._order("POST", "/api/v1/lock")
+
     def needle_out(self) -> None:
         self._order("POST", "/api/v1/needle-out")
+
+    def compare_clocks(self, offset_s: float, uncertainty_s: float) -> None:
+        """The room's clock minus the scanner's, compared just now."""
+        self._order("PUT", "/api/v1/clock", offset_s=offset_s, uncertainty_s=uncertainty_s)
 
     def describe_case(self, label: str, operator: str = "", note: str = "") -> None:
         self._order("PUT", "/api/v1/case", label=label, operator=operator, note=note)

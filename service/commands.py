@@ -7,6 +7,7 @@ text says what to do instead; every command that is carried out is an event that
 from __future__ import annotations
 
 import math
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -254,6 +255,17 @@ class Commands:
         }
         self._note("puncture", by, body)
 
+    def lock_motion(self, by: str) -> None:
+        """The needle is going in: no motion until the operator says that it is out."""
+        self._linked()
+        if self._record.running_procedure() is not None:
+            raise ConflictError("busy", "A procedure is running: end it before locking motion.")
+        try:
+            self._link.client.set_insertion_lock(True, by)
+        except BridgeError as error:
+            raise ConflictError("robot_refused", str(error)) from error
+        self._note("insertion_locked", by, {})
+
     def needle_out(self, by: str) -> None:
         """The needle is out: unlock motion."""
         status = self._linked()
@@ -264,6 +276,11 @@ class Commands:
             self._link.client.set_insertion_lock(False, by)
         except BridgeError as error:
             raise ConflictError("robot_refused", str(error)) from error
+
+    def compare_clocks(self, by: str, offset_s: float, uncertainty_s: float) -> None:
+        """The room's clock minus the scanner's, compared just now; the listener heeds the event."""
+        body = {"offset_s": offset_s, "uncertainty_s": uncertainty_s, "at_s": time.time()}
+        self._note("clock_sync", by, body)
 
     # What these have in common
 

@@ -28,7 +28,7 @@ from service.runner import ReplayMismatchError, run_procedure
 from service.sensing import ProcedureFailedError
 from service.state import RoomState
 
-_TICK_S = 0.01
+_TICK_S = 0.005
 _PUBLISH_EVERY_S = 0.1
 _LEAST_BETWEEN_STATES_S = 0.02
 _PATIENCE_S = 30.0
@@ -169,9 +169,8 @@ class ControlLoop:
             raise _Closing
         self._link.pump(_TICK_S)
         self._answer_queue()
-        if self._commands is not None:
+        if self._publish_if_due() and self._commands is not None:
             self._commands.keep_lock()
-        self._publish_if_due()
 
     def _while_moving(self) -> None:
         """Called by the link again and again while it waits for the end of a motion."""
@@ -187,12 +186,16 @@ class ControlLoop:
             _answer(self._commands, asked, moving)
             self._publish()
 
-    def _publish_if_due(self) -> None:
+    def _publish_if_due(self) -> bool:
+        """Publish when something was recorded, and every now and then; whether it was done."""
         since_s = time.monotonic() - self._published_at_s
         if since_s < _LEAST_BETWEEN_STATES_S:
-            return
-        if since_s > _PUBLISH_EVERY_S or self._record.change_count() != self._published_change:
+            return False
+        changed = self._record.change_count() != self._published_change
+        if changed or since_s > _PUBLISH_EVERY_S:
             self._publish()
+            return True
+        return False
 
     def _publish(self) -> None:
         self._published_at_s = time.monotonic()
@@ -211,7 +214,9 @@ def _answer(commands: Commands, asked: _Asked, moving: bool) -> None:
         if moving and asked.name not in _WHILE_MOVING:
             raise ConflictError("moving", "The robot moves: wait until it stands, or press STOP.")
         asked.future.set_result(getattr(commands, asked.name)(**asked.arguments))
+        log.info("command", command=asked.name, by=asked.arguments.get("by"))
     except (ConflictError, CaseRecordError) as error:
+        log.info("refused", command=asked.name, by=asked.arguments.get("by"), why=str(error))
         asked.future.set_exception(error)
     except Exception as error:
         log.exception("command failed", command=asked.name)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -189,7 +190,6 @@ def _punctured(record: CaseRecord, procedure_id: int) -> bool:
 
 def _measurement(last: Measurement) -> MeasurementState:
     found = last.result or {}
-    radius_px = found.get("radius_px")
     return MeasurementState(
         measurement_id=last.measurement_id,
         method=last.method,
@@ -199,10 +199,8 @@ def _measurement(last: Measurement) -> MeasurementState:
         slice_id=found.get("slice_id"),
         centre_px=found.get("centre_px"),
         sigma_px=found.get("sigma_px"),
-        radius_px=radius_px,
-        radius_mm=None
-        if radius_px is None
-        else radius_px * float(np.mean(found["plane"]["spacing_mm"])),
+        radius_px=found.get("radius_px"),
+        radius_mm=_radius_mm(found) if found else None,
         covariance_mm2=found.get("covariance_mm2"),
         patient_mm=found.get("patient_mm"),
         n_frames=found.get("n_frames", 0),
@@ -231,8 +229,16 @@ def reconstruction_state(record: CaseRecord, measurement: Measurement) -> Recons
     factor = int(shape[0]) // geometry.shape[0]
     fine = geometry.finer_grid(factor)
     return ReconstructionState(
-        measurement_id=measurement.measurement_id, factor=factor, **vars(fine)
+        measurement_id=measurement.measurement_id,
+        factor=factor,
+        patient_mm=result["patient_mm"],
+        radius_mm=_radius_mm(result),
+        **vars(fine),
     )
+
+
+def _radius_mm(result: Mapping[str, Any]) -> float:
+    return float(result["radius_px"]) * float(np.mean(result["plane"]["spacing_mm"]))
 
 
 def _geometry(row: SliceRow) -> SliceGeometry:

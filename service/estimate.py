@@ -36,7 +36,10 @@ class MotionNoise:
 
 @dataclass(frozen=True, eq=False)
 class FiducialEstimate:
-    """Position (2,) and covariance (2, 2) in the image plane, at the given setpoints."""
+    """Position (2,) and covariance (2, 2) in the image plane, at the given setpoints.
+
+    Of two fiducials: (4,) and (4, 4), the first one's pair first.
+    """
 
     setpoints_um: Mapping[str, int]
     plane_mm: Array
@@ -59,7 +62,7 @@ class FiducialEstimate:
     def fused_with(self, plane_mm: Array, covariance_mm2: Array) -> FiducialEstimate:
         """Combine the prediction with a measurement at the same setpoints."""
         gain = np.linalg.solve(self.covariance_mm2 + covariance_mm2, self.covariance_mm2).T
-        rest = np.eye(2) - gain
+        rest = np.eye(len(gain)) - gain
         fused = rest @ self.covariance_mm2 @ rest.T + gain @ covariance_mm2 @ gain.T
         return FiducialEstimate(
             self.setpoints_um, self.plane_mm + gain @ (plane_mm - self.plane_mm), fused
@@ -88,8 +91,8 @@ class FiducialEstimate:
 def motion_covariance(
     change_mm: Mapping[str, float], jacobian: ImageJacobian, noise: MotionNoise
 ) -> Array:
-    """Covariance (2, 2) mm² in the image plane of what one move does beside what it should."""
-    columns = (jacobian.columns[:, (0, 2)] + jacobian.columns[:, (1, 3)]) / 2
+    """Covariance (n, n) mm² in the image plane of what one move does beside what it should."""
+    columns = jacobian.mean_columns
     scatter = np.diag([noise.variance_mm2(change_mm[axis]) for axis in jacobian.axes])
     return np.asarray(columns @ scatter @ columns.T)
 

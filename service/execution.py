@@ -14,6 +14,7 @@ from robot_bridge.messages import CommandState
 from robot_bridge.phases import WorkPhase, motion_allowed
 from room_config.load import Config
 from service.measuring import measure_request, measured_from_result
+from service.plan import PLAN_VOID, why_void
 from service.room_link import RoomLink
 from service.steps import (
     Acquire,
@@ -27,6 +28,7 @@ from service.steps import (
     Outcome,
     Step,
 )
+from sr_engine.worker import is_at_position
 
 _SERVICE = "service"
 
@@ -48,6 +50,7 @@ class AcquisitionRequest:
     request_id: str
     hold_id: int
     count: int
+    slice_position_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -105,6 +108,9 @@ class Execution:
         measurement = None if step.rests_on is None else str(step.rests_on)
         while True:
             self._wait_until_ready_to_move()
+            void = self._why_void(step, command_id)
+            if void:
+                return self._refuse(void)
             with self._record.transaction():
                 self._record.end_open_hold(time.time())
                 self._record.send_move(
@@ -129,6 +135,20 @@ class Execution:
             except RefusedError as error:
                 outcome = MoveOutcome(command_id, CommandState.REFUSED, error.code, error.text, {})
             return self._settled(step, outcome)
+
+    def _why_void(self, step: MoveTo, command_id: str) -> str:
+        """Why the plan behind a move is void; a move that was sent is only asked for again."""
+        status = self._link.status
+        if step.from_um is None or status is None or self._record.has_move(command_id):
+            return ""
+        newest = self._record.last_measurement("done")
+        newest_id = None if newest is None else newest.measurement_id
+        return why_void(step.from_um, step.rests_on, status.positions_um, newest_id)
+
+    def _refuse(self, reason: str) -> Moved:
+        hold = self._hold_to_image(fresh=False)
+        self._record.append_event("plan_void", {"reason": reason}, source=_SERVICE)
+        return Moved("REFUSED", PLAN_VOID, reason, hold.hold_id, hold.readback_um)
 
     def _stands_in_motion_phase(self, wanted: WorkPhase) -> bool:
         status = self._link.status
@@ -196,15 +216,20 @@ class Execution:
         self._let_clocks_agree(hold)
         attempt = 0
         while True:
-            missing = step.count - len(self._record.slices(hold_id=hold.hold_id, state="assigned"))
+            missing = step.count - self._assigned(hold, step.slice_position_mm)
             if missing <= 0:
                 break
+            where = "" if step.slice_position_mm is None else f"@{step.slice_position_mm:.1f}"
             self.request = AcquisitionRequest(
-                f"{hold.hold_id}.{step.count}.{attempt}", hold.hold_id, missing
+                f"{hold.hold_id}.{step.count}{where}.{attempt}",
+                hold.hold_id,
+                missing,
+                step.slice_position_mm,
             )
             again = " again" if attempt else ""
-            self.prompt = f"Acquire {missing} coronal slice{'s' * (missing > 1)}{again}."
-            self._wait_for_slices(hold, missing)
+            at = "" if not where else f" at {step.slice_position_mm:.1f} mm"
+            self.prompt = f"Acquire {missing} coronal slice{'s' * (missing > 1)}{at}{again}."
+            self._wait_for_slices(hold, missing, step.slice_position_mm)
             attempt += 1
         self.request = None
         return Acquired(hold.hold_id, step.count)
@@ -215,14 +240,18 @@ class Execution:
             self.prompt = "Standing still before the next slice."
             self._wait()
 
-    def _wait_for_slices(self, hold: Hold, missing: int) -> None:
+    def _assigned(self, hold: Hold, slice_position_mm: float | None) -> int:
+        rows = self._record.slices(hold_id=hold.hold_id, state="assigned")
+        return sum(is_at_position(row, slice_position_mm) for row in rows)
+
+    def _wait_for_slices(self, hold: Hold, missing: int, slice_position_mm: float | None) -> None:
         """Until the slices are there, or as many came but were set aside, or none for too long."""
         last = self._record.last_slice()
         last_id = last.slice_id if last else 0
-        wanted = len(self._record.slices(hold_id=hold.hold_id, state="assigned")) + missing
+        wanted = self._assigned(hold, slice_position_mm) + missing
         deadline_s = time.monotonic() + self._config.service.rescan_after_s
         while time.monotonic() < deadline_s:
-            assigned = len(self._record.slices(hold_id=hold.hold_id, state="assigned"))
+            assigned = self._assigned(hold, slice_position_mm)
             aside = self._record.count_slices_after(last_id, "quarantined")
             if assigned >= wanted or (aside and assigned + aside >= wanted):
                 return

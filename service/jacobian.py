@@ -34,61 +34,66 @@ class CalibrationError(Exception):
 class ImageJacobian:
     """Estimate with covariance.
 
-    axes: names of the two axes, in the order of the columns.
-    columns: (2, 4), mm/mm; columns for (axis 0 growing, axis 0 shrinking, axis 1 growing, axis 1
-        shrinking), rows for (row direction, column direction).
-    covariance: (8, 8) of `columns.ravel()`.
+    axes: names of the n axes, in the order of the columns: two for one fiducial, four for two.
+    columns: (n, 2n), mm/mm; columns for (axis 0 growing, axis 0 shrinking, axis 1 growing, ...),
+        rows for (row direction, column direction), of the first fiducial and then of the second.
+    covariance: (2n², 2n²) of `columns.ravel()`.
     """
 
-    axes: tuple[str, str]
+    axes: tuple[str, ...]
     columns: Array
     covariance: Array
 
     @classmethod
-    def unknown(cls, axes: tuple[str, str], direction_asymmetry: float = 0.05) -> ImageJacobian:
+    def unknown(cls, axes: tuple[str, ...], direction_asymmetry: float = 0.05) -> ImageJacobian:
         """Nothing is known but that both directions of an axis agree to `direction_asymmetry`."""
         pair = np.full((2, 2), _VAGUE_SCALE**2) + np.eye(2) * direction_asymmetry**2
-        covariance = np.kron(np.eye(4), pair).astype(np.float64)
-        return cls(axes, np.zeros((2, 4)), covariance)
+        covariance = np.kron(np.eye(len(axes) ** 2), pair).astype(np.float64)
+        return cls(axes, np.zeros((len(axes), 2 * len(axes))), covariance)
+
+    @property
+    def mean_columns(self) -> Array:
+        """(n, n): per axis, the mean of its two directions."""
+        return np.asarray((self.columns[:, 0::2] + self.columns[:, 1::2]) / 2)
 
     def displacement(self, change_mm: Mapping[str, float]) -> tuple[Array, Array]:
-        """Return the fiducial's displacement (2,) mm for a setpoint change, and its covariance."""
+        """Return the displacement (n,) mm for a setpoint change, and its covariance."""
         regressors = self._regressors(change_mm)
-        observe = np.kron(np.eye(2), regressors)
+        observe = np.kron(np.eye(len(self.axes)), regressors)
         return self.columns @ regressors, observe @ self.covariance @ observe.T
 
     def setpoint_change_mm(self, displacement_mm: Array) -> dict[str, float]:
-        """Return the setpoint change that displaces the fiducial by `displacement_mm` (2,)."""
-        for choice in product((0, 1), (2, 3)):
-            matrix = self.columns[:, choice]
+        """Return the setpoint change that displaces the fiducials by `displacement_mm` (n,)."""
+        count = len(self.axes)
+        for choice in product((0, 1), repeat=count):
+            matrix = self.columns[:, [2 * axis + down for axis, down in enumerate(choice)]]
             if abs(np.linalg.det(matrix)) < 1e-3:
                 raise CalibrationError("the image Jacobian is singular: two axes act alike")
             change = np.linalg.solve(matrix, displacement_mm)
-            signs = np.array([1 if index % 2 == 0 else -1 for index in choice])
-            if np.all(change * signs >= 0):
+            if np.all(change * np.where(choice, -1, 1) >= 0):
                 return dict(zip(self.axes, change.tolist(), strict=True))
         # the columns of both directions differ so much that no choice fits: take their mean
-        matrix = (self.columns[:, (0, 2)] + self.columns[:, (1, 3)]) / 2
-        return dict(zip(self.axes, np.linalg.solve(matrix, displacement_mm).tolist(), strict=True))
+        change = np.linalg.solve(self.mean_columns, displacement_mm)
+        return dict(zip(self.axes, change.tolist(), strict=True))
 
     def updated(
         self, change_mm: Mapping[str, float], displacement_mm: Array, noise_mm2: Array
     ) -> ImageJacobian:
-        """Learn from one move: recursive least squares with the noise (2, 2) of the displacement.
+        """Learn from one move: recursive least squares with the noise (n, n) of the displacement.
 
         Short moves carry little weight by themselves, because their noise is the same.
         """
-        observe = np.kron(np.eye(2), self._regressors(change_mm))
+        observe = np.kron(np.eye(len(self.axes)), self._regressors(change_mm))
         innovation = displacement_mm - observe @ self.columns.ravel()
         innovation_covariance = observe @ self.covariance @ observe.T + noise_mm2
         gain = np.linalg.solve(innovation_covariance, observe @ self.covariance).T
         columns = self.columns.ravel() + gain @ innovation
-        rest = np.eye(8) - gain @ observe
+        rest = np.eye(len(self.covariance)) - gain @ observe
         covariance = rest @ self.covariance @ rest.T + gain @ noise_mm2 @ gain.T
-        return ImageJacobian(self.axes, columns.reshape(2, 4), covariance)
+        return ImageJacobian(self.axes, columns.reshape(self.columns.shape), covariance)
 
     def check(self) -> None:
-        """Raise CalibrationError unless every axis moves the fiducial about 1 mm per mm."""
+        """Raise CalibrationError unless each of two axes moves the fiducial about 1 mm per mm."""
         lengths = np.linalg.norm(self.columns, axis=0)
         low, high = _SCALE_RANGE
         for index, length in enumerate(lengths):
@@ -106,8 +111,8 @@ class ImageJacobian:
             )
 
     def _regressors(self, change_mm: Mapping[str, float]) -> Array:
-        first, second = (float(change_mm.get(axis, 0.0)) for axis in self.axes)
-        return np.array([max(first, 0.0), min(first, 0.0), max(second, 0.0), min(second, 0.0)])
+        changes = (float(change_mm.get(axis, 0.0)) for axis in self.axes)
+        return np.array([part for change in changes for part in (max(change, 0), min(change, 0))])
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -118,5 +123,4 @@ class ImageJacobian:
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ImageJacobian:
-        first, second = value["axes"]
-        return cls((first, second), np.array(value["columns"]), np.array(value["covariance"]))
+        return cls(tuple(value["axes"]), np.array(value["columns"]), np.array(value["covariance"]))

@@ -25,6 +25,7 @@ def measure_request(
         "expected_plane_mm": None if expected is None else list(expected),
         "gate_mm": step.gate_mm,
         "shift_sigma_mm": step.shift_sigma_mm,
+        "slice_position_mm": step.slice_position_mm,
         "radius_mm": list(radius_mm),
         "region_px": None if region_px is None else list(region_px),
     }

@@ -12,6 +12,7 @@ from service.bodies import (
     Ask,
     AssignmentBody,
     CaseBody,
+    ClockBody,
     HoldBody,
     JogBody,
     PointBody,
@@ -108,6 +109,7 @@ def _stop_body(text: bytes) -> StopBody:
 
 
 def command_router(loop: ControlLoop) -> APIRouter:
+    """Robot and procedure."""
     router = APIRouter()
     orders = Orders(loop)
 
@@ -156,10 +158,28 @@ def command_router(loop: ControlLoop) -> APIRouter:
         """Record the puncture."""
         orders.carry_out(caller, key, "puncture", body)
 
+    @router.post("/api/v1/lock", tags=["procedure"], status_code=204, responses=_REFUSALS)
+    def lock(body: Ask, caller: Caller, key: Key = None) -> None:
+        """The needle is going in: lock motion by hand (READY locks it by itself)."""
+        orders.carry_out(caller, key, "lock_motion", body)
+
     @router.post("/api/v1/needle-out", tags=["procedure"], status_code=204, responses=_REFUSALS)
     def needle_out(body: Ask, caller: Caller, key: Key = None) -> None:
         """The needle is out: unlock motion."""
         orders.carry_out(caller, key, "needle_out", body)
+
+    return router
+
+
+def clerk_router(loop: ControlLoop) -> APIRouter:
+    """What the operator tells the record: clocks, case, slices."""
+    router = APIRouter()
+    orders = Orders(loop)
+
+    @router.put("/api/v1/clock", tags=["record"], status_code=204, responses=_REFUSALS)
+    def clock(body: ClockBody, caller: Caller, key: Key = None) -> None:
+        """The two clocks were compared: slices are assigned by this from now on."""
+        orders.carry_out(caller, key, "compare_clocks", body)
 
     @router.put("/api/v1/case", tags=["record"], status_code=204, responses=_REFUSALS)
     def case(body: CaseBody, caller: Caller, key: Key = None) -> None:

@@ -8,6 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.stats import chi2
 
 from service.estimate import FiducialEstimate, MotionNoise, motion_covariance
 from service.jacobian import ImageJacobian
@@ -64,11 +65,17 @@ def move(step: MoveTo) -> ProcedureSteps[Moved]:
             return moved
         if moved.state == "REFUSED":
             break
+        # on its way it left the place where it was planned; its setpoints are still right
+        step = replace(step, from_um=None)
     raise ProcedureFailedError(moved.code, f"the robot did not move: {moved.text}")
 
 
 def measure_here(
-    method: str, expectation: Expectation | None, *, fresh: bool = False
+    method: str,
+    expectation: Expectation | None,
+    *,
+    fresh: bool = False,
+    slice_position_mm: float | None = None,
 ) -> ProcedureSteps[tuple[Acquired, Measured]]:
     """Localize the fiducial in one slice taken where the robot stands; if it fails, scan again.
 
@@ -76,9 +83,10 @@ def measure_here(
     """
     for attempt in range(_TRIES):
         # a new hold: the slices that could not be used stay out of the next try
-        acquired = yield from ask(Acquire(1, fresh=fresh or attempt > 0), Acquired)
+        acquired = yield from ask(Acquire(1, fresh or attempt > 0, slice_position_mm), Acquired)
         holds = (HoldShift(acquired.hold_id, (0.0, 0.0)),)
-        measured = yield from ask(_measure_step(holds, method, expectation), Measured)
+        step = _measure_step(holds, method, expectation, slice_position_mm=slice_position_mm)
+        measured = yield from ask(step, Measured)
         if measured.ok:
             return acquired, measured
         yield from _ask_to_rescan(measured)
@@ -95,13 +103,19 @@ def _ask_to_rescan(measured: Measured) -> ProcedureSteps[None]:
 
 
 def measure_again(
-    acquired: Acquired, method: str, expectation: Expectation | None, *, frames: int
+    acquired: Acquired,
+    method: str,
+    expectation: Expectation | None,
+    *,
+    frames: int,
+    slice_position_mm: float | None = None,
 ) -> ProcedureSteps[tuple[Acquired, Measured]]:
     """Take more slices at the same hold and localize from all of them."""
-    more = yield from ask(Acquire(frames), Acquired)
+    more = yield from ask(Acquire(frames, slice_position_mm=slice_position_mm), Acquired)
     hold_ids = dict.fromkeys((acquired.hold_id, more.hold_id))
     holds = tuple(HoldShift(hold_id, (0.0, 0.0)) for hold_id in hold_ids)
-    measured = yield from ask(_measure_step(holds, method, expectation), Measured)
+    step = _measure_step(holds, method, expectation, slice_position_mm=slice_position_mm)
+    measured = yield from ask(step, Measured)
     if not measured.ok:
         raise ProcedureFailedError(measured.reason_code, measured.reason)
     return more, measured
@@ -210,14 +224,21 @@ def estimate_from(measured: Measured, setpoints_um: Mapping[str, int]) -> Fiduci
 def check_prediction(
     predicted: FiducialEstimate, found: FiducialEstimate, gate_sigma: float, noise: MotionNoise
 ) -> None:
-    """Refuse to go on when a move did not do what was predicted: wrong sign, wrong scale, slip."""
+    """Refuse to go on when a move did not do what was predicted: wrong sign, wrong scale, slip.
+
+    gate_sigma: in two dimensions; with more of them, what is as improbable by chance.
+    """
     sigmas = predicted.distance_sigma(found.plane_mm, found.covariance_mm2)
-    if not sigmas <= gate_sigma:
+    allowed = gate_sigma
+    if len(found.plane_mm) != 2:
+        allowed = math.sqrt(chi2.isf(chi2.sf(gate_sigma**2, 2), len(found.plane_mm)))
+    if not sigmas <= allowed:
         miss = found.plane_mm - predicted.plane_mm
+        listed = ", ".join(f"{value:+.3f}" for value in miss)
         raise ProcedureFailedError(
             "prediction_missed",
-            f"the fiducial is ({miss[0]:+.3f}, {miss[1]:+.3f}) mm (row, col) from where the move "
-            f"should have brought it, {sigmas:.1f} σ (allowed {gate_sigma:.1f}, repeatability "
+            f"the fiducial is ({listed}) mm (row, col) from where the move should have brought "
+            f"it, {sigmas:.1f} σ (allowed {allowed:.1f}, repeatability "
             f"{noise.repeatability_mm * 1000:.0f} µm): calibrate again",
         )
 
@@ -227,11 +248,15 @@ def _measure_step(
     method: str,
     expectation: Expectation | None,
     shift_sigma_mm: float = 0.0,
+    slice_position_mm: float | None = None,
 ) -> Measure:
+    step = Measure(
+        holds, method, shift_sigma_mm=shift_sigma_mm, slice_position_mm=slice_position_mm
+    )
     if expectation is None:
-        return Measure(holds, method, shift_sigma_mm=shift_sigma_mm)
+        return step
     row, col = expectation.plane_mm.tolist()
-    return Measure(holds, method, (row, col), expectation.gate_mm, shift_sigma_mm)
+    return replace(step, expected_plane_mm=(row, col), gate_mm=expectation.gate_mm)
 
 
 def _difference(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:

@@ -39,6 +39,7 @@ class AcquisitionState(_Frozen):
     request_id: str
     hold_id: int
     count: int
+    slice_position_mm: float | None = None
 
 
 class QuestionState(_Frozen):
@@ -108,10 +109,12 @@ class SliceState(_Frozen):
 
 
 class ReconstructionState(_Frozen):
-    """The newest super-resolution image and its geometry."""
+    """The newest super-resolution image, where its fiducial is, and its geometry."""
 
     measurement_id: int
     factor: int
+    patient_mm: tuple[float, float, float]
+    radius_mm: float
     shape: tuple[int, int]
     position_mm: tuple[float, float, float]
     row_direction: tuple[float, float, float]
@@ -187,6 +190,7 @@ class RoomState(_Frozen):
     entry_patient_mm: tuple[float, float, float] | None = None
     punctured: bool = False
     jog_possible: bool = False
+    arrival_mode: bool = False
     processes: list[ProcessState] = []
     alarms: list[AlarmState] = []
 
@@ -198,5 +202,6 @@ class RoomState(_Frozen):
             service_id=uuid.uuid4().hex,
             room=config.room.name,
             virtual=config.room.virtual,
+            arrival_mode=config.listener.arrival_mode,
             tolerance_mm=config.service.tolerance_mm,
         )

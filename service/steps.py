@@ -17,7 +17,8 @@ class MoveTo:
     """Go to absolute setpoints and settle: ends the hold before, begins a new one.
 
     shift_px is the displacement of the fiducial (row, col) that this place has from the reference
-    of its shift set; rests_on names the measurement that the plan was made from.
+    of its shift set; rests_on names the measurement that the plan was made from, from_um where the
+    robot stood then: elsewhere, or after a newer measurement, the plan is void.
     """
 
     setpoints_um: Mapping[str, int]
@@ -27,6 +28,7 @@ class MoveTo:
     place: int = 0
     shift_px: tuple[float, float] = (0.0, 0.0)
     shift_um: Mapping[str, int] = field(default_factory=dict)
+    from_um: Mapping[str, int] | None = None
 
 
 @dataclass(frozen=True)
@@ -34,10 +36,13 @@ class Acquire:
     """Wait until `count` slices in all were acquired at the present hold.
 
     fresh: begin a new hold here first, without any motion, so that earlier slices do not count.
+    slice_position_mm: where along the slice normal; None where the protocol has it. Slices at
+    other positions do not count.
     """
 
     count: int
     fresh: bool = False
+    slice_position_mm: float | None = None
 
 
 @dataclass(frozen=True)
@@ -54,6 +59,7 @@ class Measure:
 
     expected_plane_mm and gate_mm: where it must be (image plane), None when nothing is known.
     shift_sigma_mm: how far a hold may be from its shift, per axis (standard deviation).
+    slice_position_mm: only slices at this place along their normal; None: all.
     """
 
     holds: tuple[HoldShift, ...]
@@ -61,6 +67,7 @@ class Measure:
     expected_plane_mm: tuple[float, float] | None = None
     gate_mm: float | None = None
     shift_sigma_mm: float = 0.0
+    slice_position_mm: float | None = None
 
 
 @dataclass(frozen=True)

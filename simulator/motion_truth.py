@@ -4,7 +4,6 @@ Pure bookkeeping; times are seconds since the epoch, positions millimetres by ax
 """
 
 from bisect import bisect_right
-from collections import deque
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -38,8 +37,8 @@ class Motion:
 
 class MotionTruth:
     def __init__(self, positions_mm: Mapping[str, float], now_s: float) -> None:
-        self._times: deque[float] = deque([now_s], MAX_SAMPLES)
-        self._samples: deque[dict[str, float]] = deque([dict(positions_mm)], MAX_SAMPLES)
+        self._times: list[float] = [now_s]
+        self._samples: list[dict[str, float]] = [dict(positions_mm)]
         self.motions: list[Motion] = []
         self._open: dict[str, Motion] = {}
 
@@ -66,8 +65,7 @@ class MotionTruth:
         changed = [axis for axis, mm in positions_mm.items() if mm != before[axis]]
         if not changed:
             return False
-        self._times.append(now_s)
-        self._samples.append(dict(positions_mm))
+        self._append(dict(positions_mm), now_s)
         for axis in changed:
             if axis in self._open:
                 self._open[axis].to_mm = positions_mm[axis]
@@ -76,13 +74,20 @@ class MotionTruth:
                 self.motions.append(Motion(axis, UNPROMPTED, now_s, at_mm, to_mm, now_s))
         return True
 
+    def _append(self, positions_mm: dict[str, float], now_s: float) -> None:
+        if len(self._times) >= MAX_SAMPLES:
+            del self._times[: MAX_SAMPLES // 2]
+            del self._samples[: MAX_SAMPLES // 2]
+        self._times.append(max(now_s, self._times[-1]))  # the clock may be set back
+        self._samples.append(positions_mm)
+
     @property
     def last_change_s(self) -> float:
         return self._times[-1]
 
     def history(self, t0_s: float, t1_s: float) -> dict[str, object]:
         """Where the stages stood at `t0_s`, and each change within the interval."""
-        times, positions = list(self._times), list(self._samples)
+        times, positions = self._times, self._samples
         first, last = bisect_right(times, t0_s), bisect_right(times, t1_s)
         start = max(0, min(first - 1, len(times) - 1))
         samples = [[times[i], positions[i]] for i in range(first, last)]

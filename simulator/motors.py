@@ -18,6 +18,7 @@ the loopback) takes one request a line and answers one JSON line:
 import argparse
 import contextlib
 import json
+import math
 import os
 import random
 import select
@@ -55,7 +56,10 @@ def read_state(path: Path, axes: Sequence[str]) -> dict[str, float]:
         return dict.fromkeys(axes, 0.0)
     try:
         stored = json.loads(path.read_text(encoding="utf-8"))["positions_mm"]
-        return {axis: float(stored[axis]) for axis in axes}
+        positions_mm = {axis: float(stored[axis]) for axis in axes}
+        if not all(map(math.isfinite, positions_mm.values())):
+            raise ValueError(f"not finite: {positions_mm}")
+        return positions_mm
     except (ValueError, KeyError, TypeError) as error:
         raise StateFileError(f"{path}: does not hold the positions of {axes}: {error}") from error
 
@@ -81,7 +85,7 @@ class VirtualMotors:
         self,
         axes: Sequence[str],
         positions_mm: Mapping[str, float],
-        parameters: StageParameters,
+        parameters: Mapping[str, StageParameters],
         motor: Motor,
         seed: int,
         speed_factor: float,
@@ -91,7 +95,9 @@ class VirtualMotors:
         self.truth = MotionTruth(positions_mm, time.time())
         switches = Switches()
         self.axes = {
-            name: self._axis(name, number, positions_mm[name], parameters, motor, switches, seed)
+            name: self._axis(
+                name, number, positions_mm[name], parameters[name], motor, switches, seed
+            )
             for number, name in enumerate(axes, 1)
         }
         for axis in self.axes.values():
@@ -255,6 +261,9 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--truth-port", type=int, default=0, help="on 127.0.0.1; 0: any")
     parser.add_argument("--speed-factor", type=float, default=1.0)
     parser.add_argument("--exit-with-parent", action="store_true")
+    parser.add_argument(
+        "--reversed", default="", help="axes whose motor is mounted the other way round"
+    )
     parser.add_argument("--encoder-um-per-count", type=float, help="fit encoders")
     parser.add_argument("--step-um", type=float, default=StageParameters.step_um)
     parser.add_argument("--asymmetry", type=float, default=StageParameters.asymmetry)
@@ -282,12 +291,14 @@ def _motors_from(args: argparse.Namespace) -> VirtualMotors:
         repeatability_um=args.repeatability_um,
         has_encoder=encoder_um is not None,
     )
+    reversed_axes = set(args.reversed.split(",")) - {""}
+    if unknown := reversed_axes - set(axes):
+        raise ValueError(f"--reversed: {', '.join(sorted(unknown))} is not among --axes")
+    each = {axis: replace(parameters, mounting=-1 if axis in reversed_axes else 1) for axis in axes}
     firmware = "V13" if args.model == "PMD401" else "V20"
     motor = Motor(args.model, firmware=firmware, um_per_count=encoder_um or 0.1)
     positions_mm = read_state(args.state, axes)
-    return VirtualMotors(
-        axes, positions_mm, parameters, motor, args.seed, args.speed_factor, args.state
-    )
+    return VirtualMotors(axes, positions_mm, each, motor, args.seed, args.speed_factor, args.state)
 
 
 def _serve(process: MotorsProcess, exit_with_parent: bool) -> None:

@@ -7,6 +7,7 @@ the frames agree with their shifts.
 """
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -34,6 +35,7 @@ from sr_engine.match import best_matches, correlate, radius_grid
 from sr_engine.model import DISC, Patch, Shape
 from sr_engine.noise import NoiseKind
 from sr_engine.psf import Psf
+from sr_engine.recognise import recognise_psf
 from sr_engine.signal import Pixels
 
 Array = NDArray[np.float64]
@@ -90,7 +92,7 @@ def localize(
     start_px: ArrayLike | None = None,
     radius_px: tuple[float, float] | float | None = None,
     method: str = "ml",
-    psf: Psf | None = None,
+    psf: Psf | Literal["auto"] | None = None,
     shape: Shape = DISC,
     wall_px: float | None = None,
     noise: NoiseKind | None = None,
@@ -110,7 +112,8 @@ def localize(
     radius_px: (low, high), or one number within 25 %; default 1.5 to 12 px.
     method: "ml", or one of the paper's, "sr", "bicubic", "base" (see `paper`), which heed
       start_px, radius_px, gate_px and saturation_level alone.
-    psf: point spread; default flat k-space. noise: "rician", or "gaussian" (default for a psf
+    psf: point spread; default flat k-space; "auto" recognises it in the first frame (slow, see
+      `recognise`). noise: "rician", or "gaussian" (default for a psf
       that folds, a camera, and where pixels are negative).
     sigma: noise std per channel, where known.
     wall_px: expected thickness of a shell about the object, where it has one.
@@ -134,10 +137,11 @@ def localize(
     shifts = checked_shifts(shifts_px, len(stack))
     radii = checked_radii(radius_px) or DEFAULT_RADII_PX
     start = checked_point(start_px, "start_px")
+    guess = _first_guess(stack[0], start, shifts[0], radii)
+    if psf == "auto":
+        psf = _recognised(stack[0], guess, shifts[0], radii, noise)
     psf = psf or Psf()
     noise = noise or noise_kind(stack, psf)
-
-    guess = _first_guess(stack[0], start, shifts[0], radii)
     fits: list[DiscFit] = []
     bounds = (0.8 * radii[0], 1.2 * radii[1])
     for frame, shift in zip(stack, shifts, strict=True):
@@ -156,6 +160,19 @@ def localize(
     result = _combine(fits, shifts, psf, shift_sigma_px)
     _refuse_outside_gate(result.centre_px, start, gate_px)
     return result
+
+
+def _recognised(
+    frame: Array,
+    guess: tuple[float, float, float],
+    shift: Array,
+    radii: tuple[float, float],
+    noise: NoiseKind | None,
+) -> Psf:
+    begin = (guess[0] + shift[0], guess[1] + shift[1], guess[2])
+    pixels = region_of_interest(frame, begin, Psf())
+    noise = noise or noise_kind(frame, Psf())
+    return recognise_psf(frame, pixels, begin, (0.8 * radii[0], 1.2 * radii[1]), noise)
 
 
 def noise_kind(frames: Array, psf: Psf) -> NoiseKind:

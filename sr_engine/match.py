@@ -100,7 +100,9 @@ def correlate(frame: Array, radii_px: Array, with_wall: bool = False) -> Correla
     return Correlation(explained, radii_px, areas)
 
 
-def best_matches(found: Correlation, count: int, apart_px: float, least: float = 0.0) -> list[Match]:
+def best_matches(
+    found: Correlation, count: int, apart_px: float, least: float = 0.0
+) -> list[Match]:
     """Up to `count` matches that explain more than `least`, best first.
 
     Centres are at least apart_px, and one and a half of the better one's radius, from each other.

@@ -39,6 +39,7 @@ from sr_engine.reconstruct import reconstruct
 IMAGES = "images"
 ALIVE = "worker.alive"
 _SAME_PLACE = 1e-6
+_SAME_SLICE_MM = 0.5
 log = structlog.get_logger()
 
 
@@ -113,6 +114,8 @@ def gather_frames(record: CaseRecord, request: Measurement) -> Frames:
     slices: list[SliceRow] = []
     for hold in request.request["holds"]:
         for row in record.slices(hold_id=hold["hold_id"], state="assigned"):
+            if not is_at_position(row, request.request.get("slice_position_mm")):
+                continue
             pixels.append(magnitude_pixels(record.case_dir / row.path, row.frame))
             shifts_mm.append(tuple(hold["shift_mm"]))
             slices.append(row)
@@ -121,6 +124,14 @@ def gather_frames(record: CaseRecord, request: Measurement) -> Frames:
     geometry = _common_geometry(slices)
     shifts_px = np.array(shifts_mm, dtype=float) / np.array(geometry.spacing_mm)
     return Frames(np.array(pixels), shifts_px, geometry, tuple(slices))
+
+
+def is_at_position(row: SliceRow, slice_position_mm: float | None) -> bool:
+    """True if the middle of the slice is there along its normal; None is everywhere."""
+    if slice_position_mm is None:
+        return True
+    geometry = geometry_of(row.header)
+    return abs(float(geometry.normal @ geometry.position_mm) - slice_position_mm) <= _SAME_SLICE_MM
 
 
 def geometry_of(header: Mapping[str, Any]) -> SliceGeometry:

@@ -64,10 +64,12 @@ def _found_against_true(axes: Axes, study: NumericalStudy, method: str) -> None:
     answered = [t for t in study.trials if method in t.estimates_px]
     true = np.array([t.truth_px[1] for t in answered])
     found = np.array([t.estimates_px[method][1] for t in answered])
-    ends = [true.min(), true.max()]
+    ends = np.array([true.min(), true.max()])
     axes.plot(ends, ends, color="0.6", linewidth=1, zorder=1)
     axes.scatter(true, found, s=10, color=COLOURS[method], zorder=2)
-    axes.set_xlabel("true column, px")
+    # The same section in every panel, whatever went astray.
+    section = (ends[0] - 0.4, ends[1] + 0.4)
+    axes.set(xlim=section, ylim=section, xlabel="true column, px")
     axes.set_aspect("equal")
     axes.grid(alpha=0.25)
 
@@ -112,9 +114,7 @@ def _curves(axes: Axes, study: NumericalStudy, scene: str, against: str) -> None
         has = [c for c in cells if method in c.summaries]
         where = [getattr(c.point, against) for c in has]
         means = [c.summaries[method].mean_error_px for c in has]
-        axes.plot(
-            where, means, "o-", color=COLOURS[method], label=labels(study)[method], markersize=4
-        )
+        axes.plot(where, means, "o-", color=COLOURS[method], label=named[method], markersize=4)
     where = [getattr(c.point, against) for c in cells]
     bounds = [c.bound_px for c in cells]
     axes.plot(where, bounds, "--", color="0.45", label=f"bound, {study.point.frame_count} frames")

@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from case_record.rows import SliceRow
 from robot_bridge.pmd_protocol import MICROSTEPS_PER_STEP
 from service.measuring import measure_request, measured_from_result
+from service.plan import PLAN_VOID, why_void
 from service.plane import ImagePlane
 from service.sensing import ABORT
 from service.steps import (
@@ -73,7 +74,10 @@ class Imaging(Protocol):
     def model_sigma_px(self) -> float: ...
 
     def look(
-        self, stage_mm: Mapping[str, float], rng: np.random.Generator
+        self,
+        stage_mm: Mapping[str, float],
+        rng: np.random.Generator,
+        slice_position_mm: float | None = None,
     ) -> tuple[Array, SliceGeometry]: ...
 
     def true_plane_mm(self, stage_mm: Mapping[str, float]) -> Array:
@@ -91,9 +95,12 @@ class MrImaging:
     model_sigma_px: float = 0.0
 
     def look(
-        self, stage_mm: Mapping[str, float], rng: np.random.Generator
+        self,
+        stage_mm: Mapping[str, float],
+        rng: np.random.Generator,
+        slice_position_mm: float | None = None,
     ) -> tuple[Array, SliceGeometry]:
-        taken = acquire(self.room, stage_mm, rng)
+        taken = acquire(self.room, stage_mm, rng, slice_position_mm=slice_position_mm)
         return taken.magnitude, taken.geometry
 
     def true_plane_mm(self, stage_mm: Mapping[str, float]) -> Array:
@@ -112,7 +119,10 @@ class CameraImaging:
     model_sigma_px: float = 0.022
 
     def look(
-        self, stage_mm: Mapping[str, float], rng: np.random.Generator
+        self,
+        stage_mm: Mapping[str, float],
+        rng: np.random.Generator,
+        slice_position_mm: float | None = None,
     ) -> tuple[Array, SliceGeometry]:
         return photograph(self.room, stage_mm, self.camera, rng)
 
@@ -188,6 +198,11 @@ class OfflineRoom:
         return Answered(self._answer(step), "operator")
 
     def _move(self, step: MoveTo) -> Moved:
+        if step.from_um is not None:
+            void = why_void(step.from_um, step.rests_on, self.setpoints_um, self._measurements)
+            if void:
+                hold_id = max(self._slices)
+                return Moved("REFUSED", PLAN_VOID, void, hold_id, dict(self.setpoints_um))
         self.moves.append(dict(step.setpoints_um))
         reached = 1.0
         if self.stop_next_moves:
@@ -209,10 +224,10 @@ class OfflineRoom:
             self._slices[max(self._slices) + 1] = []
         hold_id = max(self._slices)
         slices = self._slices[hold_id]
-        while len(slices) < step.count:
-            pixels, geometry = self.imaging.look(self.stage_mm, self._rng)
+        while len(_at_position(slices, step.slice_position_mm)) < step.count:
+            pixels, geometry = self.imaging.look(self.stage_mm, self._rng, step.slice_position_mm)
             slices.append(SeenSlice(pixels, geometry, self._row(hold_id)))
-        return Acquired(hold_id, len(slices))
+        return Acquired(hold_id, step.count)
 
     def _row(self, hold_id: int) -> SliceRow:
         """What the record would hold of the next slice; time is the scanner's alone."""
@@ -239,7 +254,11 @@ class OfflineRoom:
 
     def _measure(self, step: Measure) -> Measured:
         self._measurements += 1
-        taken = [(one, hold.shift_mm) for hold in step.holds for one in self._slices[hold.hold_id]]
+        taken = [
+            (one, hold.shift_mm)
+            for hold in step.holds
+            for one in _at_position(self._slices[hold.hold_id], step.slice_position_mm)
+        ]
         geometry = taken[0][0].geometry
         frames = Frames(
             np.array([one.pixels for one, _ in taken]),
@@ -271,6 +290,17 @@ def drive(stage: PiezoLegsStage, steps: float) -> None:
 
 def plane_of(geometry: SliceGeometry) -> ImagePlane:
     return ImagePlane(geometry.row_direction, geometry.col_direction, geometry.spacing_mm)
+
+
+def _at_position(slices: list[SeenSlice], position_mm: float | None) -> list[SeenSlice]:
+    """Those whose middle lies there along their normal; None: all."""
+    if position_mm is None:
+        return slices
+    return [
+        one
+        for one in slices
+        if abs(float(one.geometry.normal @ one.geometry.position_mm) - position_mm) <= 0.5
+    ]
 
 
 def _agree(question: AskOperator) -> str:

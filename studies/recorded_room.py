@@ -22,7 +22,7 @@ from service.steps import Acquire, Acquired, Measure, Measured, Moved, MoveTo, O
 from simulator.config import ScannerSettings
 from simulator.dicom_writer import AcquisitionStamp, Series, Study, write_mr_image
 from simulator.stage_physics import StageParameters
-from sr_engine.worker import measure
+from sr_engine.worker import is_at_position, measure
 from studies.offline_room import MrImaging, OfflineRoom
 
 _MOVE_S, _SLICE_S = 1.0, 0.5
@@ -118,12 +118,17 @@ class RecordedRoom(OfflineRoom):
         hold = self.record.open_hold()
         assert hold is not None
         self.record.expect_slices(hold.hold_id, step.count)
-        while len(self.record.slices(hold_id=hold.hold_id)) < step.count:
-            self._receive(hold.hold_id)
+        position_mm = step.slice_position_mm
+        while self._count_at(hold.hold_id, position_mm) < step.count:
+            self._receive(hold.hold_id, position_mm)
         return Acquired(hold.hold_id, step.count)
 
-    def _receive(self, hold_id: int) -> None:
-        pixels, geometry = self.imaging.look(self.stage_mm, self._rng)
+    def _count_at(self, hold_id: int, position_mm: float | None) -> int:
+        rows = self.record.slices(hold_id=hold_id)
+        return sum(is_at_position(row, position_mm) for row in rows)
+
+    def _receive(self, hold_id: int, slice_position_mm: float | None) -> None:
+        pixels, geometry = self.imaging.look(self.stage_mm, self._rng, slice_position_mm)
         self.frames += 1
         stamp = AcquisitionStamp(
             self.clock_s, _SLICE_S, self.frames, 1, self.clock_s + 2 * _SLICE_S

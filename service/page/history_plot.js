@@ -1,7 +1,7 @@
 // Error of each measurement to the target that was set then, ± 1 σ, on a logarithmic scale: the
 // interesting errors go from 20 mm down to 0.02 mm.
 
-import { byId, replace, s, whenChanged } from "./dom.js";
+import { byId, h, replace, s, whenChanged } from "./dom.js";
 import { mm } from "./words.js";
 
 const [WIDE, HIGH, LEFT, BOTTOM, TOP] = [460, 170, 42, 18, 8];
@@ -10,7 +10,7 @@ const MOST = 40;
 export const drawHistory = whenChanged(({ measurements, toleranceMm }) => {
   const shown = measurements.filter((m) => m.error_mm !== null && m.error_mm !== undefined).slice(-MOST);
   const box = byId("history");
-  if (!shown.length) return replace(box, s("svg", { viewBox: "0 0 460 40" }, s("text", { x: 0, y: 20 }, "No measurement with a target yet.")));
+  if (!shown.length) return replace(box, h("p", { class: "quiet" }, "No measurement with a target yet."));
   const low = Math.min(0.01, toleranceMm / 4);
   const high = Math.max(1, ...shown.map((m) => 1.3 * (m.error_mm + m.sigma_mm)));
   const y = (value) => {

@@ -171,7 +171,7 @@ export class Images {
   tickAge() {
     const slice = this.state?.slice;
     if (!slice) return;
-    setText(this.ageText, `Slice ${slice.slice_id}: received ${clock(slice.received_s)}, ${age(Date.now() / 1000 - slice.received_s)} ago`);
+    setText(this.ageText, `Slice ${slice.slice_id}: received ${clock(slice.received_s)}, ${age(Date.now() / 1000 - slice.received_s)} old`);
     setText(this.source, `${slice.state}${slice.time_source ? ` · time from ${slice.time_source}` : ""}`);
   }
 
@@ -179,11 +179,18 @@ export class Images {
 
   overlays() {
     if (!this.state) return;
-    for (const view of [this.slice, this.sr]) if (view.geometry) view.overlay(this.overlay(view.geometry));
+    if (this.slice.geometry) this.slice.overlay(this.overlay(this.slice.geometry, this.state.measurement));
+    if (!this.sr.geometry) return;
+    // the robot may have moved since the reconstruction: show the fiducial where it was then
+    const current = this.state.reconstruction.measurement_id === this.state.measurement?.measurement_id;
+    const shown = this.state.reconstruction;
+    this.sr.overlay(this.overlay(this.sr.geometry, current ? this.state.measurement : { patient_mm: shown.patient_mm, radius_mm: shown.radius_mm }));
+    this.sr.what.textContent = `×${shown.factor}, measurement ${shown.measurement_id}${current ? "" : " (earlier)"}`;
+    this.sr.what.classList.toggle("earlier", !current);
   }
 
-  overlay(geometry) {
-    const { measurement: found, target_patient_mm: target, entry_patient_mm: entry, question, tolerance_mm: tolerance } = this.state;
+  overlay(geometry, found) {
+    const { target_patient_mm: target, entry_patient_mm: entry, question, tolerance_mm: tolerance } = this.state;
     const at = (pointMm) => {
       const [row, col] = pixelFromPatient(geometry, pointMm);
       return [col * geometry.spacing_mm[1], row * geometry.spacing_mm[0]];
@@ -192,12 +199,13 @@ export class Images {
     if (found?.patient_mm) {
       const [x, y] = at(found.patient_mm);
       const current = found.slice_id === this.state.slice?.slice_id;
+      const newest = found === this.state.measurement;
       const shape = ellipse(found.covariance_mm2 ?? [[0, 0], [0, 0]], 3);
       parts.push(s("circle", { id: geometry.factor ? null : "fiducial", cx: x, cy: y, r: found.radius_mm ?? 4, class: `thin c-fiducial${current ? "" : " dash"}` }),
         cross(x, y, 0.7, "c-fiducial"),
         s("ellipse", { rx: shape.long, ry: shape.short, transform: `translate(${x} ${y}) rotate(${shape.turnDeg})`, class: "thin c-fiducial" }));
       const plan = question?.plan;
-      if (plan) {
+      if (plan && newest) {
         const [dRow, dCol] = plan.displacement_mm;
         parts.push(arrow(x, y, x + dCol, y + dRow, Math.min(2, 0.4 * Math.hypot(dRow, dCol))),
           s("circle", { cx: x + dCol, cy: y + dRow, r: found.radius_mm ?? 4, class: "thin c-plan dash" }));

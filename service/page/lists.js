@@ -7,14 +7,21 @@ import { clock, day, mm, plain } from "./words.js";
 
 const MOST_EVENTS = 200;
 
+const UNSAID = new Set(["command_id", "path", "sop_instance_uid", "received_s", "frames", "assigned", "from", "code", "plan_id", "question_id", "name"]);
+
+function oneValue(value) {
+  if (typeof value === "number") return Number.isInteger(value) ? String(value) : value.toFixed(3);
+  if (Array.isArray(value)) return `(${value.map(oneValue).join(", ")})`;
+  if (typeof value === "object") return Object.entries(value).map(([name, part]) => `${name} ${oneValue(part)}`).join(" ");
+  return String(value);
+}
+
+// The body of an event, short: what a person wants to know at a glance.
 function inWords(body) {
-  const parts = [];
-  for (const [name, value] of Object.entries(body)) {
-    if (value === null || value === "" || name === "command_id") continue;
-    const text = typeof value === "object" ? JSON.stringify(value) : String(value);
-    parts.push(`${name.replaceAll("_", " ")} ${text}`);
-  }
-  return parts.join(", ").slice(0, 220);
+  return Object.entries(body)
+    .filter(([name, value]) => !UNSAID.has(name) && value !== null && value !== "")
+    .map(([name, value]) => (typeof value === "string" ? value : `${name.replace(/_(um|mm|s)$/, "").replaceAll("_", " ")} ${oneValue(value)}`))
+    .join(", ").slice(0, 160);
 }
 
 export function addEvent(event) {
@@ -86,6 +93,7 @@ export const drawJog = whenChanged(({ positions_um, possible }) => {
     return h("div", { class: "row" }, h("b", {}, axis), button(-STEPS_MM[0]), button(-STEPS_MM[1]),
       h("output", {}, `${mm(um / 1000, 3)} mm`), button(STEPS_MM[1]), button(STEPS_MM[0]));
   });
-  replace(byId("jog-body"), rows.length ? rows : "No link to the robot.",
+  const lock = h("p", {}, h("button", { type: "button", disabled: !possible, onclick: () => act(() => order("POST", "/api/v1/lock")) }, "Lock motion for the needle"));
+  replace(byId("jog-body"), rows.length ? [...rows, lock] : "No link to the robot.",
     possible ? null : h("p", { class: "quiet" }, "Only while no procedure runs, the robot is armed and not locked."));
 });

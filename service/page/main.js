@@ -29,11 +29,13 @@ function draw(state) {
   drawJog({ positions_um: robot.positions_um, possible: page.role === "operator" && state.jog_possible });
   drawCase({ description: state.case, case_uid: state.case_uid, role: page.role });
   newAside([state.slices.quarantined, state.hold?.hold_id, page.role]);
+  newPast([state.procedure, state.punctured, state.case]);
   newMeasurements([state.measurement?.measurement_id, state.measurement?.state, state.target_patient_mm]);
 }
 
 const quietly = (promise) => promise.catch(() => { /* the stream says when the service is back */ });
 const newAside = whenChanged(() => quietly(drawAside(page.state, page.role)));
+const newPast = whenChanged(() => quietly(drawPast()));
 const newMeasurements = whenChanged(() => quietly(loadMeasurements()));
 
 async function loadMeasurements() {
@@ -81,7 +83,6 @@ async function begin() {
   byId("events").replaceChildren();
   events.reverse().forEach(addEvent);
   live.open(events.at(-1)?.event_id ?? 0);
-  quietly(drawPast());
 }
 
 byId("stop").onclick = pressStop;

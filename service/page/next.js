@@ -28,6 +28,8 @@ export function actionsFor(state) {
   add("Start the approach", post("approach"), free && state.calibrated && state.target_patient_mm);
   add("Start the calibration", post("calibration"), free);
   add("Target: where the fiducial is now", "target-here", free && state.calibrated && state.measurement?.patient_mm);
+  const wanted = state.acquisition_request;
+  add(`The slices of hold ${wanted?.hold_id} were acquired`, post("acquisition", { hold_id: wanted?.hold_id }), state.arrival_mode && wanted);
   add("End the procedure", post("abort"), !idle);
   return list.sort((a, b) => (a.last ? 1 : 0) - (b.last ? 1 : 0));
 }

@@ -18,8 +18,7 @@ export function percent(value) {
 
 export function age(seconds) {
   if (!Number.isFinite(seconds)) return NONE;
-  if (seconds < 0.95) return "now";
-  if (seconds < 60) return `${Math.round(seconds)} s`;
+  if (seconds < 60) return `${Math.max(0, Math.round(seconds))} s`;
   if (seconds < 3600) return `${Math.floor(seconds / 60)} min ${Math.round(seconds % 60)} s`;
   return `${Math.floor(seconds / 3600)} h ${Math.floor((seconds % 3600) / 60)} min`;
 }

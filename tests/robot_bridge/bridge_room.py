@@ -7,15 +7,16 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Protocol
 
 from robot_bridge.client import BridgeClient
 from robot_bridge.emulator import EmulatorServer, PseudoTerminal
 from robot_bridge.emulator_axis import EmulatedController, Motor
 from robot_bridge.emulator_bus import EmulatedBus
-from robot_bridge.emulator_physics import IdealStage
+from robot_bridge.emulator_physics import IdealStage, StagePhysics
 from robot_bridge.emulator_switches import Switches
 from robot_bridge.phases import WorkPhase
 from simulator.serial_line import LineFaults, NullModem
@@ -37,22 +38,22 @@ name = "{name}"
 controller = "{controller}"
 address = {address}
 drive = "closed_loop"
-travel_min_mm = -15.0
-travel_max_mm = 15.0
+travel_min_mm = -{travel_mm}
+travel_max_mm = {travel_mm}
 sign = 1
 speed_hz = {speed_hz}
 counts_per_mm = 10000
 tolerance_um = 20
-home_mm = 0.0
+home_mm = -{travel_mm}
 """
 
 
 class EmulatedControllers:
     """Four closed-loop axes on one bus, served by a thread; their true positions are visible."""
 
-    def __init__(self) -> None:
+    def __init__(self, make_stage: Callable[[], StagePhysics] = IdealStage) -> None:
         switches = Switches()
-        self.stages = {name: IdealStage() for name in AXES}
+        self.stages = {name: make_stage() for name in AXES}
         controllers = [
             EmulatedController(address, stage, Motor(), switches, time.monotonic(), 1.0)
             for address, stage in enumerate(self.stages.values(), start=1)
@@ -89,6 +90,10 @@ class EmulatedControllers:
         self._server.close()
 
 
+class Closable(Protocol):
+    def close(self) -> None: ...
+
+
 @dataclass
 class BridgeRoom:
     folder: Path
@@ -96,8 +101,9 @@ class BridgeRoom:
     line: NullModem
     config_file: Path
     daemons: list[subprocess.Popen[str]] = field(default_factory=list)
-    clients: list[BridgeClient] = field(default_factory=list)
+    clients: list[Closable] = field(default_factory=list)
     outcomes: list[object] = field(default_factory=list)
+    test: str = "test"
 
     def start_daemon(
         self, *arguments: str, python: Sequence[str] = (sys.executable, "-m", "robot_bridge")
@@ -122,20 +128,35 @@ class BridgeRoom:
         return client
 
     def ready_client(self) -> BridgeClient:
-        """Open, declared at zero, armed, in MANUAL."""
+        """Open, armed in MANUAL, without lock; standing at zero, which is declared as it is."""
         client = self.client()
         client.open(15.0)
-        client.declare_position(dict.fromkeys(AXES, 0), "test")
+        if client.status.stopped:
+            client.rearm("test")
+        if client.status.insertion_locked:
+            client.set_insertion_lock(False, "test")
+        truth_um = {axis: round(um) for axis, um in self.controllers.positions_um().items()}
+        client.declare_position(truth_um, "test")
         client.set_phase(WorkPhase.MANUAL, "test")
         client.arm("test")
+        if any(abs(um) > 5 for um in truth_um.values()):
+            name = f"back to zero {time.monotonic_ns()}"
+            assert client.move(name, dict.fromkeys(AXES, 0), None).done
         return client
 
     def status_file(self) -> dict[str, object]:
         return json.loads((self.folder / "state" / "bridge_status.json").read_text())
 
+    def id(self, name: str) -> str:
+        """A command id that no other test of this room has used."""
+        return f"{self.test}/{name}"
+
+    def close_clients(self) -> None:
+        while self.clients:
+            self.clients.pop().close()
+
     def close(self) -> None:
-        for client in self.clients:
-            client.close()
+        self.close_clients()
         for daemon in self.daemons:
             if daemon.poll() is None:
                 daemon.terminate()
@@ -150,15 +171,25 @@ class BridgeRoom:
 
 @contextlib.contextmanager
 def bridge_room(
-    folder: Path, faults: LineFaults | None = None, *, seed: int = 0, speed_hz: int = 1500,
+    folder: Path,
+    faults: LineFaults | None = None,
+    *,
+    seed: int = 0,
+    speed_hz: int = 1500,
+    travel_mm: float = 15.0,
+    make_stage: Callable[[], StagePhysics] = IdealStage,
     extra: str = "",
-) -> Iterator[BridgeRoom]:  # fmt: skip
-    controllers = EmulatedControllers()
+) -> Iterator[BridgeRoom]:
+    controllers = EmulatedControllers(make_stage)
     line = NullModem(faults, seed=seed).start()
     text = CONFIG.format(link=line.near, state_dir=folder / "state", extra=extra)
     for address, name in enumerate(AXES, start=1):
         text += AXIS.format(
-            name=name, controller=controllers.url, address=address, speed_hz=speed_hz
+            name=name,
+            controller=controllers.url,
+            address=address,
+            speed_hz=speed_hz,
+            travel_mm=travel_mm,
         )
     config_file = folder / "room.toml"
     config_file.write_text(text)

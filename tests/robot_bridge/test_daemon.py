@@ -14,6 +14,7 @@ from bridge_room import AXES, BridgeRoom, bridge_room, wait_for
 from robot_bridge.client import LinkLostError, MoveOutcome, RefusedError
 from robot_bridge.messages import CommandState
 from robot_bridge.phases import WorkPhase
+from simulator.serial_line import LineFaults
 
 FAR = dict.fromkeys(AXES, 14_000)  # about two seconds at full speed
 
@@ -29,7 +30,7 @@ def begin_long_move(room: BridgeRoom, client, command_id: str = "long") -> threa
 
 def _move(room: BridgeRoom, client, command_id: str) -> None:
     try:
-        room.outcomes.append(client.move(command_id, FAR, None))
+        room.outcomes.append(client.move(room.id(command_id), FAR, None))
     except LinkLostError as error:
         room.outcomes.append(error)
 
@@ -45,41 +46,52 @@ def assert_stands(room: BridgeRoom, within_s: float) -> float:
     return took_s
 
 
-def test_moves_arrive_where_they_were_sent(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        client = room.ready_client()
-        outcome = client.move("a", {"xt": 1000, "yt": -2000, "xb": 500, "yb": 0}, "m1")
-        assert outcome.state is CommandState.DONE, outcome
-        truth = room.controllers.positions_um()
-        assert truth == pytest.approx({"xt": 1000, "yt": -2000, "xb": 500, "yb": 0}, abs=20)
-        assert outcome.readback_um == pytest.approx(truth, abs=5)
+def test_moves_arrive_where_they_were_sent(shared_room: BridgeRoom):
+    room = shared_room
+    client = room.ready_client()
+    outcome = client.move(room.id("a"), {"xt": 1000, "yt": -2000, "xb": 500, "yb": 0}, "m1")
+    assert outcome.state is CommandState.DONE, outcome
+    truth = room.controllers.positions_um()
+    assert truth == pytest.approx({"xt": 1000, "yt": -2000, "xb": 500, "yb": 0}, abs=20)
+    assert outcome.readback_um == pytest.approx(truth, abs=5)
 
 
-def test_stop_during_motion_stands_within_100_ms(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        client = room.ready_client()
-        thread = begin_long_move(room, client)
-        client.request_stop()
-        assert assert_stands(room, within_s=2.0) < 0.15  # the benchmark measures it properly
-        thread.join(5)
-        assert isinstance(room.outcomes[0], MoveOutcome)
-        assert room.outcomes[0].code == "operator_stop"
+def test_on_a_line_that_loses_a_fifth_of_the_frames_moves_arrive_all_the_same(
+    shared_room: BridgeRoom,
+):
+    room = shared_room
+    client = room.ready_client()
+    room.line.set_faults(LineFaults(loss=0.2, bit_flip=0.02, duplicate=0.05))
+    for number in range(8):
+        setpoints_um = dict.fromkeys(AXES, 200 * (number % 3))
+        outcome = client.move(room.id(f"{number}"), setpoints_um, None)
+        assert outcome.done, outcome
+        assert room.controllers.positions_um() == pytest.approx(setpoints_um, abs=20)
+    assert client.counters.frames_resent > 0
 
 
-def test_emergency_also_parks_the_drives(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        client = room.ready_client()
-        thread = begin_long_move(room, client)
-        client.request_stop(emergency=True)
-        assert_stands(room, within_s=1.0)
-        thread.join(5)
-        client.pump(2.0)
-        assert client.status.phase is WorkPhase.EMERGENCY
-        assert client.status.parked
-        assert all(controller.parked for controller in room.controllers.all)
+def test_stop_during_motion_stands_within_100_ms(shared_room: BridgeRoom):
+    room = shared_room
+    client = room.ready_client()
+    thread = begin_long_move(room, client)
+    client.request_stop()
+    assert assert_stands(room, within_s=2.0) < 0.15  # the benchmark measures it properly
+    thread.join(5)
+    assert isinstance(room.outcomes[0], MoveOutcome)
+    assert room.outcomes[0].code == "operator_stop"
+
+
+def test_emergency_also_parks_the_drives(shared_room: BridgeRoom):
+    room = shared_room
+    client = room.ready_client()
+    thread = begin_long_move(room, client)
+    client.request_stop(emergency=True)
+    assert_stands(room, within_s=1.0)
+    thread.join(5)
+    client.pump(2.0)
+    assert client.status.phase is WorkPhase.EMERGENCY
+    assert client.status.parked
+    assert all(controller.parked for controller in room.controllers.all)
 
 
 SERVICE = """
@@ -142,7 +154,7 @@ def test_killing_the_daemon_stops_the_motors_through_its_guardian(tmp_path: Path
         hello = client.open(15.0)
         assert hello.boot_id_changed
         assert not hello.position_certain
-        outcome = client.move("long", FAR, None)
+        outcome = client.move(room.id("long"), FAR, None)
         assert (outcome.state, outcome.code) == (CommandState.FAILED, "bridge_restarted")
         assert not room.controllers.moving
 
@@ -184,7 +196,7 @@ def test_a_signal_ends_the_daemon_with_standing_motors(tmp_path: Path, number: i
         assert "internal_error" not in room.log
         room.start_daemon()
         client.open(15.0)
-        outcome = client.move("long", FAR, None)
+        outcome = client.move(room.id("long"), FAR, None)
         assert (outcome.state, outcome.code) == (CommandState.STOPPED, "shutting_down")
 
 
@@ -199,13 +211,12 @@ def test_the_end_of_the_parent_ends_the_daemon_with_standing_motors(tmp_path: Pa
         assert daemon.wait(5) == 0
 
 
-def test_an_unplugged_line_stops_the_motion_within_the_deadman(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        client = room.ready_client()
-        begin_long_move(room, client)
-        room.line.unplug()
-        assert_stands(room, within_s=1.2)
+def test_an_unplugged_line_stops_the_motion_within_the_deadman(shared_room: BridgeRoom):
+    room = shared_room
+    client = room.ready_client()
+    begin_long_move(room, client)
+    room.line.unplug()
+    assert_stands(room, within_s=1.2)
 
 
 def test_the_insertion_lock_survives_kill_9(tmp_path: Path):
@@ -216,22 +227,24 @@ def test_the_insertion_lock_survives_kill_9(tmp_path: Path):
         daemon.kill()
         daemon.wait()
         room.start_daemon()
-        client = room.ready_client()
+        client.open(15.0)
         assert client.status.insertion_locked
+        client.declare_position(dict.fromkeys(AXES, 0), "test")
+        client.set_phase(WorkPhase.MANUAL, "test")
+        client.arm("test")
         outcome = client.move("a", FAR, None)
         assert (outcome.state, outcome.code) == (CommandState.REFUSED, "insertion_locked")
         client.set_insertion_lock(False, "test")
         assert client.move("b", dict.fromkeys(AXES, 100), None).done
 
 
-def test_a_second_daemon_on_the_same_state_is_refused(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        room.ready_client()
-        second = room.start_daemon()
-        assert second.wait(10) == 3
-        assert "another bridge is running" in room.log
-        assert "Traceback" not in room.log
+def test_a_second_daemon_on_the_same_state_is_refused(shared_room: BridgeRoom):
+    room = shared_room
+    room.ready_client()
+    second = room.start_daemon()
+    assert second.wait(10) == 3
+    assert "another bridge is running" in room.log
+    assert "Traceback" not in room.log
 
 
 def test_without_a_controller_the_daemon_says_which_port_and_exits_3(tmp_path: Path):
@@ -246,6 +259,15 @@ def test_without_a_controller_the_daemon_says_which_port_and_exits_3(tmp_path: P
         assert "Traceback" not in room.log
 
 
+def test_a_status_file_that_cannot_be_written_is_named_and_exit_3(tmp_path: Path):
+    extra = f'status_file = "{tmp_path}/room.toml/status.json"'
+    with bridge_room(tmp_path, extra=extra) as room:
+        daemon = room.start_daemon()
+        assert daemon.wait(10) == 3
+        assert "room.toml/status.json: cannot be written" in room.log
+        assert "Traceback" not in room.log
+
+
 def test_a_bad_configuration_is_one_line_and_exit_2(tmp_path: Path):
     file = tmp_path / "room.toml"
     file.write_text('[bridge]\nlink = "/dev/ttyUSB0"\nstate_dir = "s"\ndeadman = 1\n')
@@ -255,13 +277,12 @@ def test_a_bad_configuration_is_one_line_and_exit_2(tmp_path: Path):
     assert ended.stderr == f"autospine bridge: {file}: bridge.axis: is missing\n"
 
 
-def test_the_status_file_shows_health(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        client = room.ready_client()
-        client.pump(0.8)
-        health = room.status_file()
-        assert health["armed"] is True
-        assert health["phase"] == "MANUAL"
-        assert health["line_open"] is True
-        assert health["positions_um"].keys() == set(AXES)
+def test_the_status_file_shows_health(shared_room: BridgeRoom):
+    room = shared_room
+    client = room.ready_client()
+    client.pump(0.8)
+    health = room.status_file()
+    assert health["armed"] is True
+    assert health["phase"] == "MANUAL"
+    assert health["line_open"] is True
+    assert health["positions_um"].keys() == set(AXES)

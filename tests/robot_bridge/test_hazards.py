@@ -23,12 +23,15 @@ from robot_bridge.messages import (
     Answer,
     Arm,
     DeclarePosition,
+    Heartbeat,
     Hello,
     HelloRequest,
     Message,
     Move,
     NoSession,
+    Rearm,
     SetPhase,
+    Status,
     pack,
     unpack,
 )
@@ -42,8 +45,9 @@ FAR = dict.fromkeys(AXES, 14_000)
 class RawService:
     """A service that says whatever it likes: bytes on the line, without the client's manners."""
 
-    def __init__(self, url: str) -> None:
-        self.line = SerialTransport(url, 115200)
+    def __init__(self, room: BridgeRoom) -> None:
+        self.line = SerialTransport(room.line.far, 115200)
+        room.clients.append(self)
         self.session = 0
         self.sequence = 0
         self._deframer = Deframer(FrameCounters())
@@ -97,23 +101,34 @@ class RawService:
         assert isinstance(answer, Answer)
         return answer
 
+    def status(self) -> Status:
+        beat = Heartbeat(self.now_ms)
+        self.line.write(framing.encode(Frame(beat.KIND, self.session, 1, pack(beat))))
+        status = self.receive(Status)
+        assert isinstance(status, Status)
+        return status
+
     def make_ready(self) -> str:
         """Armed in MANUAL at zero; returns the motion that a move must be based on."""
+        stop_count = self.status().stop_count
+        if self.status().stopped:
+            assert self.ask(Rearm("raw", stop_count, self.now_ms)).code == "ok"
         zero = dict.fromkeys(AXES, 0)
         assert self.ask(DeclarePosition(zero, "raw", self.now_ms)).code == "ok"
         assert self.ask(SetPhase("MANUAL", "raw", self.now_ms)).code == "ok"
-        assert self.ask(Arm("raw", 0, self.now_ms)).code == "ok"
-        return f"declared:{self.boot_id}:1"
+        assert self.ask(Arm("raw", stop_count, self.now_ms)).code == "ok"
+        return self.status().last_motion
+
+    def close(self) -> None:
+        self.line.close()
 
     def move(self, command_id: str, setpoints_um: dict, based_on: str) -> Answer:
         return self.ask(Move(command_id, setpoints_um, None, based_on, self.now_ms))
 
 
-def never_moved(room: BridgeRoom) -> bool:
+def never_moved(room: BridgeRoom, before_um: dict[str, float]) -> bool:
     time.sleep(0.2)
-    return not room.controllers.moving and all(
-        abs(um) < 5 for um in room.controllers.positions_um().values()
-    )
+    return not room.controllers.moving and room.controllers.positions_um() == before_um
 
 
 def test_h3_a_move_frame_repeated_by_the_line_moves_once(tmp_path: Path):
@@ -130,30 +145,30 @@ def test_h3_a_move_frame_repeated_by_the_line_moves_once(tmp_path: Path):
         assert journal.count('"kind":"begin"') == 3
 
 
-def test_h4_garbage_chatter_echo_and_half_frames_move_nothing(tmp_path: Path):
+def test_h4_garbage_chatter_echo_and_half_frames_move_nothing(shared_room: BridgeRoom):
     rng = random.Random(4)
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        raw = RawService(room.line.far)
-        raw.say_hello()
-        move = Move("evil", FAR, None, raw.make_ready(), raw.now_ms)
-        frame = framing.encode(Frame(Move.KIND, raw.session, raw.sequence + 1, pack(move)))
-        for _ in range(200):
-            damaged = bytearray(frame)
-            place = rng.randrange(1, len(frame) - 1)
-            match rng.randrange(4):
-                case 0:
-                    damaged[place] ^= 1 << rng.randrange(8)
-                case 1:
-                    del damaged[place:]  # half a frame
-                case 2:
-                    damaged = bytearray(rng.randbytes(60))  # another device
-                case 3:
-                    damaged = bytearray(b"\0X1T14000,1500\r\0")  # chatter of a motor bus
-            raw.line.write(bytes(damaged))
-        assert never_moved(room)
-        health = wait_for_health(room, lambda h: int(h["frames"]["bad"]) > 100)
-        assert health["commands"] == {}
+    room = shared_room
+    raw = RawService(room)
+    raw.say_hello()
+    before_um = room.controllers.positions_um()
+    move = Move(room.id("evil"), FAR, None, raw.make_ready(), raw.now_ms)
+    frame = framing.encode(Frame(Move.KIND, raw.session, raw.sequence + 1, pack(move)))
+    for _ in range(200):
+        damaged = bytearray(frame)
+        place = rng.randrange(1, len(frame) - 1)
+        match rng.randrange(4):
+            case 0:
+                damaged[place] ^= 1 << rng.randrange(8)
+            case 1:
+                del damaged[place:]  # half a frame
+            case 2:
+                damaged = bytearray(rng.randbytes(60))  # another device
+            case 3:
+                damaged = bytearray(b"\0X1T14000,1500\r\0")  # chatter of a motor bus
+        raw.line.write(bytes(damaged))
+    assert never_moved(room, before_um)
+    health = wait_for_health(room, lambda h: int(h["frames"]["bad"]) > 100)
+    assert health["moving"] is False
 
 
 def wait_for_health(room: BridgeRoom, condition) -> dict:
@@ -182,8 +197,9 @@ def test_h7_a_controller_that_restarts_leaves_the_position_uncertain(tmp_path: P
 def test_h7_frames_of_an_old_session_are_answered_with_no_session(tmp_path: Path):
     with bridge_room(tmp_path) as room:
         daemon = room.start_daemon()
-        raw = RawService(room.line.far)
+        raw = RawService(room)
         boot = raw.say_hello()
+        before_um = room.controllers.positions_um()
         old = Move("old", FAR, None, raw.make_ready(), raw.now_ms)
         frame = framing.encode(Frame(Move.KIND, raw.session, raw.sequence + 1, pack(old)))
         daemon.kill()
@@ -196,7 +212,7 @@ def test_h7_frames_of_an_old_session_are_answered_with_no_session(tmp_path: Path
         answer = raw.receive(NoSession)
         assert isinstance(answer, NoSession)
         assert answer.boot_id == new_boot.boot_id
-        assert never_moved(room)
+        assert never_moved(room, before_um)
 
 
 OUTSIDE = [
@@ -214,157 +230,165 @@ OUTSIDE = [
 ]
 
 
-def test_h9_nothing_beyond_travel_and_no_nonsense_ever_moves(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        raw = RawService(room.line.far)
-        raw.say_hello()
-        base = raw.make_ready()
-        for number, (setpoints_um, code, text) in enumerate(OUTSIDE):
-            move = Move(f"h9-{number}", setpoints_um, None, base, raw.now_ms)
-            payload = cbor2.dumps(list(move.__dict__.values()))
-            answer = raw.ask(move, payload)
-            assert answer.code == code, (setpoints_um, answer)
-            assert text in answer.text
-        assert never_moved(room)
-        # The line and the session are as good as before.
-        assert raw.move("inside", dict.fromkeys(AXES, 0), base).state == "ACCEPTED"
-        health = wait_for_health(room, lambda h: sum(h["refused"].values()) >= len(OUTSIDE))
-        assert health["refused"]["beyond_travel"] == 3
+def test_h9_nothing_beyond_travel_and_no_nonsense_ever_moves(shared_room: BridgeRoom):
+    room = shared_room
+    raw = RawService(room)
+    raw.say_hello()
+    base = raw.make_ready()
+    before_um = room.controllers.positions_um()
+    for number, (setpoints_um, code, text) in enumerate(OUTSIDE):
+        move = Move(room.id(f"h9-{number}"), setpoints_um, None, base, raw.now_ms)
+        payload = cbor2.dumps(list(move.__dict__.values()))
+        answer = raw.ask(move, payload)
+        assert answer.code == code, (setpoints_um, answer)
+        assert text in answer.text
+    assert never_moved(room, before_um)
+    # The line and the session are as good as before.
+    assert raw.move(room.id("inside"), dict.fromkeys(AXES, 0), base).state == "ACCEPTED"
+    health = wait_for_health(room, lambda h: sum(h["refused"].values()) >= len(OUTSIDE))
+    assert health["refused"]["beyond_travel"] == 3
 
 
-def test_h2_a_move_resting_on_an_outdated_measurement_is_refused(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        client = room.ready_client()
-        measured_after = client.status.last_motion
-        assert client.move("a", dict.fromkeys(AXES, 300), "m1").done
-        by_base = client.move("b", dict.fromkeys(AXES, 400), "m2", based_on_motion=measured_after)
-        by_use = client.move("c", dict.fromkeys(AXES, 400), "m1")
-        assert by_base.code == by_use.code == "outdated_measurement"
-        assert "outdated measurement" in by_base.text
-        assert room.controllers.positions_um() == pytest.approx(dict.fromkeys(AXES, 300), abs=20)
+def test_h2_a_move_resting_on_an_outdated_measurement_is_refused(shared_room: BridgeRoom):
+    room = shared_room
+    client = room.ready_client()
+    measured_after = client.status.last_motion
+    assert client.move(room.id("a"), dict.fromkeys(AXES, 300), "m1").done
+    by_base = client.move(
+        room.id("b"), dict.fromkeys(AXES, 400), "m2", based_on_motion=measured_after
+    )
+    by_use = client.move(room.id("c"), dict.fromkeys(AXES, 400), "m1")
+    assert by_base.code == by_use.code == "outdated_measurement"
+    assert "outdated measurement" in by_base.text
+    assert room.controllers.positions_um() == pytest.approx(dict.fromkeys(AXES, 300), abs=20)
 
 
-def test_h13_stop_works_without_a_session_and_from_another_program(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        client = room.ready_client()
-        thread = threading.Thread(target=_move_until_stopped, args=(client,), daemon=True)
-        thread.start()
-        wait_for(lambda: room.controllers.moving, 5, "the motors to turn")
-        time.sleep(0.1)
-        line = os.open(room.line.far, os.O_RDWR | os.O_NOCTTY)
-        os.write(line, framing.encode_stop(1, False))  # thirteen bytes, no session
-        os.close(line)
-        wait_for(lambda: not room.controllers.moving, 0.5, "standstill")
-        thread.join(10)
-        assert max(room.controllers.positions_um().values()) < 13_000
+def test_h13_stop_works_without_a_session_and_from_another_program(shared_room: BridgeRoom):
+    room = shared_room
+    client = room.ready_client()
+    thread = threading.Thread(target=_move_until_stopped, args=(room, client), daemon=True)
+    thread.start()
+    wait_for(lambda: room.controllers.moving, 5, "the motors to turn")
+    time.sleep(0.1)
+    line = os.open(room.line.far, os.O_RDWR | os.O_NOCTTY)
+    os.write(line, framing.encode_stop(1, False))  # thirteen bytes, no session
+    os.close(line)
+    wait_for(lambda: not room.controllers.moving, 0.5, "standstill")
+    thread.join(10)
+    assert max(room.controllers.positions_um().values()) < 13_000
 
 
-def _move_until_stopped(client: BridgeClient) -> None:
+def _move_until_stopped(room: BridgeRoom, client: BridgeClient) -> None:
     try:
-        client.move("long", FAR, None)
+        client.move(room.id("long"), FAR, None)
     except LinkLostError:
         return
 
 
-def test_h13_stop_overtakes_a_flood_of_other_frames(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        raw = RawService(room.line.far)
-        raw.say_hello()
-        assert raw.move("long", FAR, raw.make_ready()).state == "ACCEPTED"
-        wait_for(lambda: room.controllers.moving, 5, "the motors to turn")
-        flood = b"".join(
-            framing.encode(Frame(0x13, raw.session, 100 + n, b"\x80")) for n in range(60)
-        )
-        raw.line.write(flood + framing.encode_stop(2, False))
-        wait_for(lambda: not room.controllers.moving, 0.5, "standstill")
-        assert raw.acknowledged(2.0)
-        assert max(room.controllers.positions_um().values()) < 13_000
+def test_h13_stop_overtakes_a_flood_of_other_frames(shared_room: BridgeRoom):
+    room = shared_room
+    raw = RawService(room)
+    raw.say_hello()
+    assert raw.move(room.id("long"), FAR, raw.make_ready()).state == "ACCEPTED"
+    wait_for(lambda: room.controllers.moving, 5, "the motors to turn")
+    flood = b"".join(framing.encode(Frame(0x13, raw.session, 100 + n, b"\x80")) for n in range(60))
+    raw.line.write(flood + framing.encode_stop(2, False))
+    wait_for(lambda: not room.controllers.moving, 0.5, "standstill")
+    assert raw.acknowledged(2.0)
+    assert max(room.controllers.positions_um().values()) < 13_000
 
 
-def test_h13_stop_works_while_the_controllers_answer_nothing(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        client = room.ready_client()
-        thread = threading.Thread(target=_move_until_stopped, args=(client,), daemon=True)
-        thread.start()
-        wait_for(lambda: room.controllers.moving, 5, "the motors to turn")
-        time.sleep(0.1)
-        room.controllers.bus.faults.drop_probability = 1.0
-        client.request_stop()
-        wait_for(lambda: not room.controllers.moving, 0.5, "standstill")
-        thread.join(15)
-        assert max(room.controllers.positions_um().values()) < 13_000
-        room.controllers.bus.faults.drop_probability = 0.0
+def test_h13_stop_works_while_the_controllers_answer_nothing(shared_room: BridgeRoom):
+    room = shared_room
+    client = room.ready_client()
+    thread = threading.Thread(target=_move_until_stopped, args=(room, client), daemon=True)
+    thread.start()
+    wait_for(lambda: room.controllers.moving, 5, "the motors to turn")
+    time.sleep(0.1)
+    room.controllers.bus.faults.drop_probability = 1.0
+    client.request_stop()
+    wait_for(lambda: not room.controllers.moving, 0.5, "standstill")
+    thread.join(15)
+    assert max(room.controllers.positions_um().values()) < 13_000
+    room.controllers.bus.faults.drop_probability = 0.0
 
 
-def test_h13_a_peer_with_another_schema_can_still_stop(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        raw = RawService(room.line.far)
-        raw.say_hello()
-        hello = HelloRequest(5, "older", PROTOCOL_VERSION, "0" * 16)
-        raw.line.write(framing.encode(Frame(hello.KIND, 0, 0, pack(hello))))
+def test_h13_a_peer_with_another_schema_can_still_stop(shared_room: BridgeRoom):
+    room = shared_room
+    raw = RawService(room)
+    raw.say_hello()
+    hello = HelloRequest(5, "older", PROTOCOL_VERSION, "0" * 16)
+    raw.line.write(framing.encode(Frame(hello.KIND, 0, 0, pack(hello))))
+    answer = raw.receive(Hello)
+    while answer.nonce != 5:  # an earlier hello was said twice
         answer = raw.receive(Hello)
-        assert isinstance(answer, Hello)
-        assert answer.code == "schema_mismatch"
-        raw.line.write(framing.encode_stop(3, False))
-        assert raw.acknowledged(2.0)
-        assert wait_for_health(room, lambda h: h["stopped"])["stop_reason"] == "operator_stop"
+    assert answer.code == "schema_mismatch"
+    raw.line.write(framing.encode_stop(3, False))
+    assert raw.acknowledged(2.0)
+    wait_for_health(room, lambda h: h["stopped"] and h["stop_reason"] == "operator_stop")
 
 
-def test_the_lock_set_in_motion_stops_it(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        client = room.ready_client()
-        raw_outcome: list = []
-        done = threading.Event()
+def test_the_lock_set_in_motion_stops_it(shared_room: BridgeRoom):
+    room = shared_room
+    client = room.ready_client()
+    raw_outcome: list = []
+    done = threading.Event()
 
-        def lock_when_moving(state, status) -> None:
-            if not done.is_set():
-                done.set()
-                time.sleep(0.1)
-                client.set_insertion_lock(True, "test")
+    def lock_when_moving(state, status) -> None:
+        if not done.is_set():
+            done.set()
+            time.sleep(0.1)
+            client.set_insertion_lock(True, "test")
 
-        raw_outcome.append(client.move("a", FAR, None, lock_when_moving))
-        assert raw_outcome[0].code == "locked_in_motion"
-        assert max(room.controllers.positions_um().values()) < 13_000
+    raw_outcome.append(client.move(room.id("a"), FAR, None, lock_when_moving))
+    assert raw_outcome[0].code == "locked_in_motion"
+    assert max(room.controllers.positions_um().values()) < 13_000
+    client.arm("test")
+    assert client.move(room.id("b"), dict.fromkeys(AXES, 0), None).code == "insertion_locked"
+
+
+def test_a_stalled_axis_fails_the_move_and_latches(shared_room: BridgeRoom):
+    room = shared_room
+    client = room.ready_client()
+    room.controllers.all[1].faults.stalled = True
+    outcome = client.move(room.id("a"), dict.fromkeys(AXES, 2000), None)
+    assert outcome.state == "FAILED"
+    assert outcome.code == "motor_fault"
+    assert "yt" in outcome.text
+    assert client.status.stopped
+    room.controllers.all[1].faults.stalled = False
+    with pytest.raises(RefusedError):
         client.arm("test")
-        assert client.move("b", dict.fromkeys(AXES, 0), None).code == "insertion_locked"
 
 
-def test_a_stalled_axis_fails_the_move_and_latches(tmp_path: Path):
-    with bridge_room(tmp_path) as room:
-        room.start_daemon()
-        client = room.ready_client()
-        room.controllers.all[1].faults.stalled = True
-        outcome = client.move("a", dict.fromkeys(AXES, 2000), None)
-        assert outcome.state == "FAILED"
-        assert outcome.code == "motor_fault"
-        assert "yt" in outcome.text
-        assert client.status.stopped
-        room.controllers.all[1].faults.stalled = False
-        with pytest.raises(RefusedError):
-            client.arm("test")
-
-
-def test_h13_stop_gets_through_while_the_control_thread_hangs_on_a_bad_line(tmp_path: Path):
+def test_h13_stop_gets_through_while_the_control_thread_hangs_on_a_bad_line(
+    shared_room: BridgeRoom,
+):
     """The page's thread calls it; nobody pumps, and half of the frames are lost."""
-    with bridge_room(tmp_path, seed=13) as room:
-        room.start_daemon()
-        client = room.ready_client()
+    room = shared_room
+    client = room.ready_client()
 
-        def hang(state, status) -> None:
-            room.line.set_faults(LineFaults(loss=0.5))
-            threading.Timer(0.1, client.request_stop).start()
-            time.sleep(0.6)
-            moving_after_600_ms.append(room.controllers.moving)
-            room.line.set_faults(LineFaults())
+    def hang(state, status) -> None:
+        room.line.set_faults(LineFaults(loss=0.5))
+        threading.Timer(0.1, client.request_stop).start()
+        time.sleep(0.6)
+        moving_after_600_ms.append(room.controllers.moving)
+        room.line.set_faults(LineFaults())
 
-        moving_after_600_ms: list[bool] = []
-        outcome = client.move("a", FAR, None, hang)
-        assert moving_after_600_ms[0] is False
-        assert outcome.code == "operator_stop", outcome
+    moving_after_600_ms: list[bool] = []
+    outcome = client.move(room.id("a"), FAR, None, hang)
+    assert moving_after_600_ms[0] is False
+    assert outcome.code == "operator_stop", outcome
+
+
+def test_h13_stop_gets_through_without_an_open_session_of_ones_own(shared_room: BridgeRoom):
+    """The service lost its session; another program even has the line."""
+    room = shared_room
+    other = room.ready_client()
+    service = room.client()
+    service.request_stop()
+    wait_for(lambda: other.pump(0.02) or other.status.stopped, 2, "the stop")
+    assert other.status.stop_reason == "operator_stop"
+    other.close()
+    service.open(5.0)
+    wait_for(lambda: service.pump(0.02) or service.stop_acknowledged, 2, "the acknowledgement")

@@ -4,9 +4,11 @@ import itertools
 
 import pytest
 from pmd_rig import finish, opened, rig, wait_until
+from virtual_line import VirtualLine
 
 from robot_bridge.emulator_axis import Motor
 from robot_bridge.emulator_switches import Switches
+from robot_bridge.motors import POLL_BOUND_S, STOP_BOUND_S
 
 SINGLE = [
     Switches(terminator="cr"),
@@ -22,6 +24,7 @@ SINGLE = [
     Switches(broadcast_stop=False),
     Switches(encoder_type_description=False),
     Switches(bare_status=False),
+    Switches(collisions="lost"),
 ]
 COMBINED = [
     Switches(terminator=terminator, run_answer="222", hex_case="upper", own_echo=echo)
@@ -86,3 +89,49 @@ def test_stop_needs_no_broadcast(broadcast_works: bool):
         motors.stop()
         with made.lock:
             assert not any(c.moving for c in made.bus.controllers)
+
+
+@pytest.mark.parametrize("into_the_answer_s", [0.0001, 0.0004, 0.0008])
+def test_stop_gets_through_although_it_collides_with_an_answer(into_the_answer_s: float):
+    line = VirtualLine(
+        {"xt": "open_loop", "yt": "closed_loop"}, switches=Switches(collisions="lost")
+    )
+    line.open_at_zero()
+    line.motors.move_to({"xt": 15_000, "yt": 15_000})
+    line.poll(10)
+    assert line.moving()
+    line.write(b"X1U0\r")
+    line.wait(into_the_answer_s)
+    before = line.bus.collisions
+    begun_s = line.now_s
+    line.motors.stop()
+    assert line.bus.collisions == before + 1
+    assert not line.moving()
+    assert line.now_s - begun_s < 0.1
+
+
+@pytest.mark.parametrize("latency_s", [0.001, 0.016])
+def test_four_axes_on_one_bus_behind_a_slow_adapter(latency_s: float):
+    names = ("xt", "yt", "xb", "yb")
+    line = VirtualLine(dict.fromkeys(names, "open_loop"))
+    line.bus.faults.reply_delay_s = latency_s
+    line.open_at_zero()
+    line.motors.move_to({name: 1000 * k for k, name in enumerate(names, 1)})
+    longest_s, moving = 0.0, True
+    while moving:
+        begun_s = line.now_s
+        status = line.motors.poll()
+        longest_s = max(longest_s, line.now_s - begun_s)
+        moving = status.moving
+        line.wait(0.005)
+    assert status.reached, status
+    assert longest_s < POLL_BOUND_S
+    for k in (1, 2, 3, 4):
+        assert line.position_um(k) == pytest.approx(1000 * k, abs=1)
+    line.motors.move_to(dict.fromkeys(names, 15_000))
+    line.poll(15)
+    assert line.moving()
+    begun_s = line.now_s
+    line.motors.stop()
+    assert line.now_s - begun_s < STOP_BOUND_S
+    assert not line.moving()

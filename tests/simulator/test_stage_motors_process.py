@@ -124,6 +124,15 @@ def test_an_encoder_brings_the_stage_where_it_was_sent(folder: Path):
         assert truth_mm["yt"] == pytest.approx(-5.0, abs=0.002)
 
 
+def test_a_motor_mounted_the_other_way_round_moves_the_axis_the_other_way(folder: Path):
+    with room(folder, "--reversed", "xt") as made, driver(made) as motors:
+        motors.move_to({"xt": 2000, "yt": 2000})
+        finish(motors)
+        truth_mm = made.ask("where")["positions_mm"]
+        assert -2.2 < truth_mm["xt"] < -1.8
+        assert 1.8 < truth_mm["yt"] < 2.2
+
+
 def test_history_tells_motion_from_rest(folder: Path):
     with room(folder) as made, driver(made) as motors:
         begun_s = time.time()
@@ -223,6 +232,8 @@ def test_requests_that_make_no_sense_get_an_error_and_the_process_lives_on(folde
     ("options", "named"),
     [
         (["--axes", "xt,xt"], "--axes"),
+        (["--reversed", "zt"], "--reversed"),
+        (["--scatter", "nan"], "scatter"),
         (["--speed-factor", "0"], "--speed-factor"),
         (["--encoder-um-per-count", "nan"], "--encoder-um-per-count"),
         (["--pty-path", "/nonexistent/x"], "/nonexistent"),
@@ -237,8 +248,11 @@ def test_bad_options_end_in_one_line_and_code_two(folder: Path, options: list[st
     assert len(done.stderr.strip().splitlines()) == 1
 
 
-def test_a_damaged_state_file_is_refused_by_name(folder: Path):
-    (folder / "state.json").write_text("{}")
+@pytest.mark.parametrize(
+    "text", ["{}", "", '{"positions_mm": {"xt": 1}}', '{"positions_mm": {"xt": NaN, "yt": 0}}']
+)
+def test_a_damaged_state_file_is_refused_by_name(folder: Path, text: str):
+    (folder / "state.json").write_text(text)
     command = [sys.executable, "-m", "simulator.motors", "--pty-path", str(folder / "pty")]
     command += ["--state", str(folder / "state.json")]
     done = subprocess.run(command, capture_output=True, text=True, timeout=20)

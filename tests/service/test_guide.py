@@ -1,0 +1,227 @@
+"""Four degrees of freedom in the offline room, the needle's tip against the truth."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from service.guide import (
+    REJECT,
+    GuideArguments,
+    GuideCalibration,
+    GuideGeometry,
+    approach_guide,
+    calibrate_guide,
+    state_on_line,
+    tip_of,
+)
+from service.kinematics import Line
+from service.sensing import ProcedureFailedError
+from simulator.config import Fiducial, VirtualRoom
+from simulator.mr_slice import slice_geometry
+from simulator.scene import true_fiducials_mm
+from simulator.stage_physics import StageParameters
+from studies.offline_room import MrImaging, OfflineRoom, plane_of
+
+AXES = ("xt", "yt", "xb", "yb")
+UPPER, LOWER, APART, BELOW = 48.0, 14.0, 60.0, 80.0
+ROOM = VirtualRoom(
+    fiducials=(
+        Fiducial(name="upper", mount="guide", along_guide_mm=UPPER),
+        Fiducial(name="lower", mount="guide", along_guide_mm=LOWER),
+    )
+)
+GEOMETRY = GuideGeometry(UPPER, LOWER, APART, (58.0 - APART + UPPER, 58.0 - APART + LOWER), BELOW)
+PLANE = plane_of(slice_geometry(ROOM.protocol))
+
+
+def arguments(**changes):
+    values = {
+        "axes": AXES,
+        "origin_um": dict.fromkeys(AXES, 0),
+        "move_um": 6000,
+        "geometry": GEOMETRY,
+        "travel_um": dict.fromkeys(AXES, (-20_000, 20_000)),
+        "position_gate_mm": 3.0,
+        "gate_sigma": 5.0,
+        "repeatability_mm": 0.014,
+        "scale_error": 0.015,
+    }
+    return GuideArguments(**{**values, **changes})
+
+
+def make_room(seed, room=ROOM, **options):
+    return OfflineRoom(MrImaging(room), StageParameters(), seed, axes=AXES, **options)
+
+
+def true_guide(room):
+    """Line of the guide (point: lower joint) in patient mm."""
+    centres = true_fiducials_mm(ROOM, room.stage_mm)
+    line = Line.through(centres["lower"], centres["upper"])
+    return Line(line.at(-LOWER), line.direction)
+
+
+def true_tip(room):
+    return PLANE.from_patient(true_guide(room).at(-BELOW).tolist())
+
+
+def true_state(room):
+    centres = true_fiducials_mm(ROOM, room.stage_mm)
+    return np.concatenate([PLANE.from_patient(centres[n].tolist()) for n in ("upper", "lower")])
+
+
+@pytest.fixture(scope="module")
+def recorded():
+    room = make_room(0)
+    return room.run(calibrate_guide(arguments())).to_json()
+
+
+@pytest.fixture
+def calibrated(recorded):
+    """The same room again, as it stands after its calibration."""
+    room = make_room(0)
+    return room, room.run(calibrate_guide(arguments()))
+
+
+def test_the_tip_is_linear_in_what_is_seen():
+    room = make_room(0)
+    for stage in ((0, 0, 0, 0), (5, -3, 1, 8), (-9, 2, 6, -7)):
+        for axis, value in zip(AXES, stage, strict=True):
+            room.stages[axis].displace(1000.0 * value - room.stages[axis].position_um)
+        tip = GEOMETRY.tip_from_fiducials @ true_state(room)
+        assert tip == pytest.approx(true_tip(room), abs=1e-9)
+
+
+def test_the_state_of_a_guide_on_a_given_line_is_what_would_be_seen():
+    room = make_room(0)
+    room.stages["xt"].displace(4000.0)
+    line = true_guide(room)
+    state = state_on_line(GEOMETRY, line.point_mm, line.direction, PLANE)
+    assert state == pytest.approx(true_state(room), abs=1e-9)
+
+
+def test_the_tip_80_mm_below_the_lower_plane_is_as_wrong_as_its_covariance_says():
+    """30 approaches: honest covariance at the tip, and most tips within the tolerance."""
+    normalised, errors, frames = [], [], []
+    for seed in range(5):
+        room = make_room(seed)
+        calibration = room.run(calibrate_guide(arguments()))
+        home = calibration.estimate.plane_mm
+        rng = np.random.default_rng(seed)
+        for _ in range(6):
+            target = home + rng.uniform(-3.0, 3.0, 4)
+            wanted = GEOMETRY.tip_from_fiducials @ target
+            before = room.frames
+            arrival = room.run(
+                approach_guide(arguments(target_mm=tuple(target.tolist())), calibration)
+            )
+            calibration = arrival.calibration
+            tip, covariance = tip_of(GEOMETRY, calibration.estimate)
+            miss = true_tip(room) - tip
+            normalised.append(miss @ np.linalg.solve(covariance, miss))
+            errors.append(np.linalg.norm(true_tip(room) - wanted))
+            frames.append(room.frames - before)
+            assert arrival.frames == frames[-1]
+            assert arrival.probability >= 0.95
+    assert np.mean(np.array(normalised) < 5.99) >= 0.85
+    assert np.median(errors) < 0.12
+    assert np.quantile(errors, 0.95) < 0.25
+    assert np.median(frames) <= 8
+
+
+def test_the_jacobian_has_the_levers_of_the_mechanism(calibrated):
+    _, calibration = calibrated
+    matrix = calibration.jacobian.mean_columns
+    # robot x is patient left (columns), robot y is inferior (rows)
+    assert matrix[1, 0] == pytest.approx(UPPER / APART, abs=0.05)
+    assert matrix[3, 0] == pytest.approx(LOWER / APART, abs=0.05)
+    assert matrix[1, 2] == pytest.approx(1 - UPPER / APART, abs=0.05)
+    assert matrix[3, 2] == pytest.approx(1 - LOWER / APART, abs=0.05)
+
+
+def test_fiducials_above_the_top_plane_work_as_well():
+    along = (105.0, 75.0)
+    room_model = VirtualRoom(
+        fiducials=tuple(
+            Fiducial(name=name, mount="guide", along_guide_mm=at)
+            for name, at in zip(("upper", "lower"), along, strict=True)
+        ),
+        background=(),
+    )
+    geometry = GuideGeometry(*along, APART, (58.0 - APART + along[0], 58.0 - APART + along[1]))
+    room = make_room(1, room_model)
+    # the levers are long: stay within the field of view and near the vertical
+    calibration = room.run(calibrate_guide(arguments(geometry=geometry, move_um=4000)))
+    target = calibration.estimate.plane_mm + np.array([1.0, -2.0, 0.5, 0.5])
+    changed = arguments(geometry=geometry, target_mm=tuple(target.tolist()))
+    arrival = room.run(approach_guide(changed, calibration))
+    assert arrival.probability >= 0.95
+    assert np.linalg.norm(arrival.tip_error_mm) < 0.25
+
+
+def test_swapped_fiducials_are_noticed_in_the_calibration():
+    swapped = replace(GEOMETRY, slice_positions_mm=GEOMETRY.slice_positions_mm[::-1])
+    room = make_room(0)
+    with pytest.raises(ProcedureFailedError, match="taken for each other") as failure:
+        room.run(calibrate_guide(arguments(geometry=swapped)))
+    assert failure.value.code == "fiducials_swapped"
+    assert len(room.moves) == 5  # and not moved any further
+
+
+def test_fiducials_swapped_after_the_calibration_stop_the_approach(calibrated):
+    room, calibration = calibrated
+    swapped = replace(GEOMETRY, slice_positions_mm=GEOMETRY.slice_positions_mm[::-1])
+    room.stages["xt"].displace(9000.0)  # the guide leans: the two are not above each other
+    moves = len(room.moves)
+    target = tuple((calibration.estimate.plane_mm + 1.0).tolist())
+    with pytest.raises(ProcedureFailedError):
+        room.run(approach_guide(arguments(geometry=swapped, target_mm=target), calibration))
+    assert len(room.moves) <= moves + 1
+
+
+def test_a_lost_fiducial_is_said_so(calibrated):
+    room, calibration = calibrated
+    room.imaging = MrImaging(VirtualRoom(fiducials=(ROOM.fiducials[0],), background=()))
+    moves = len(room.moves)
+    target = tuple((calibration.estimate.plane_mm + 1.0).tolist())
+    with pytest.raises(ProcedureFailedError, match="no usable measurement"):
+        room.run(approach_guide(arguments(target_mm=target), calibration))
+    assert len(room.moves) == moves + 1
+
+
+def test_an_axis_that_does_not_move_is_named():
+    room = make_room(0)
+    room.stages["xb"].apply_load(1.05)  # beyond what the motor can push
+    with pytest.raises(ProcedureFailedError, match=r"axis xb: .* moved 0\.00 mm per mm"):
+        room.run(calibrate_guide(arguments()))
+
+
+def test_a_line_out_of_reach_moves_nothing(calibrated):
+    room, calibration = calibrated
+    moves = len(room.moves)
+    target = tuple((calibration.estimate.plane_mm + np.array([0.0, 30.0, 0.0, 0.0])).tolist())
+    with pytest.raises(ProcedureFailedError, match="outside its travel"):
+        room.run(approach_guide(arguments(target_mm=target), calibration))
+    assert len(room.moves) == moves
+
+
+def test_a_rejected_move_is_not_made(calibrated):
+    _, calibration = calibrated
+    room = make_room(0, answer=lambda _: REJECT)
+    room.setpoints_um = dict(calibration.estimate.setpoints_um)
+    target = tuple((calibration.estimate.plane_mm + 1.0).tolist())
+    with pytest.raises(ProcedureFailedError, match="rejected by operator"):
+        room.run(approach_guide(arguments(target_mm=target), calibration))
+    assert room.moves == []
+
+
+def test_a_calibration_survives_its_json_form(recorded):
+    again = GuideCalibration.from_json(json.loads(json.dumps(recorded)))
+    assert again.to_json() == recorded
+
+
+@pytest.mark.parametrize(("upper", "lower"), [(10.0, 10.0), (10.0, 20.0), (10.0, -5.0)])
+def test_fiducials_in_an_order_that_cannot_be_are_refused(upper, lower):
+    with pytest.raises(ValueError, match="above the lower one"):
+        GuideGeometry(upper, lower, APART, (1.0, 2.0))
