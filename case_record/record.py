@@ -521,6 +521,11 @@ class CaseRecord:
             raise CaseRecordError(f"{self.case_dir}: there is no move {command_id}")
         return _move(row)
 
+    def has_move(self, command_id: str) -> bool:
+        """True once the move was recorded, that is: it may have gone onto the line."""
+        row = self._db.execute("SELECT 1 FROM move WHERE command_id = ?", (command_id,)).fetchone()
+        return row is not None
+
     def moves(self) -> list[Move]:
         return [_move(row) for row in self._db.execute("SELECT * FROM move ORDER BY rowid")]
 

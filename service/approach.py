@@ -195,7 +195,12 @@ def _go(
     calibration = standing.calibration
     before = calibration.estimate if standing.seen is None else standing.seen.found
     moved = yield from move(
-        MoveTo(dict(plan.setpoints_um), "approach", rests_on=plan.measurement_id)
+        MoveTo(
+            dict(plan.setpoints_um),
+            "approach",
+            rests_on=plan.measurement_id,
+            from_um=dict(plan.from_um),
+        )
     )
     predicted = calibration.estimate.moved_to(
         moved.readback_um, calibration.jacobian, arguments.noise

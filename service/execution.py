@@ -14,6 +14,7 @@ from robot_bridge.messages import CommandState
 from robot_bridge.phases import WorkPhase, motion_allowed
 from room_config.load import Config
 from service.measuring import measure_request, measured_from_result
+from service.plan import PLAN_VOID, why_void
 from service.room_link import RoomLink
 from service.steps import (
     Acquire,
@@ -107,6 +108,9 @@ class Execution:
         measurement = None if step.rests_on is None else str(step.rests_on)
         while True:
             self._wait_until_ready_to_move()
+            void = self._why_void(step, command_id)
+            if void:
+                return self._refuse(void)
             with self._record.transaction():
                 self._record.end_open_hold(time.time())
                 self._record.send_move(
@@ -131,6 +135,20 @@ class Execution:
             except RefusedError as error:
                 outcome = MoveOutcome(command_id, CommandState.REFUSED, error.code, error.text, {})
             return self._settled(step, outcome)
+
+    def _why_void(self, step: MoveTo, command_id: str) -> str:
+        """Why the plan behind a move is void; a move that was sent is only asked for again."""
+        status = self._link.status
+        if step.from_um is None or status is None or self._record.has_move(command_id):
+            return ""
+        newest = self._record.last_measurement("done")
+        newest_id = None if newest is None else newest.measurement_id
+        return why_void(step.from_um, step.rests_on, status.positions_um, newest_id)
+
+    def _refuse(self, reason: str) -> Moved:
+        hold = self._hold_to_image(fresh=False)
+        self._record.append_event("plan_void", {"reason": reason}, source=_SERVICE)
+        return Moved("REFUSED", PLAN_VOID, reason, hold.hold_id, hold.readback_um)
 
     def _stands_in_motion_phase(self, wanted: WorkPhase) -> bool:
         status = self._link.status

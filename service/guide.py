@@ -255,7 +255,12 @@ def approach_guide(
             yield from _confirm(arguments, calibration, setpoints_um)
             before = calibration.estimate if seen is None else seen.at(prior.setpoints_um)
             moved = yield from move(
-                MoveTo(setpoints_um, "approach", rests_on=calibration.measurement_id)
+                MoveTo(
+                    setpoints_um,
+                    "approach",
+                    rests_on=calibration.measurement_id,
+                    from_um=dict(calibration.estimate.setpoints_um),
+                )
             )
             prior = calibration.estimate.moved_to(
                 moved.readback_um, calibration.jacobian, arguments.noise

@@ -13,6 +13,9 @@ from service.estimate import FiducialEstimate
 from service.jacobian import ImageJacobian
 
 Array = NDArray[np.float64]
+PLAN_VOID = "plan_void"
+# a readback may differ by so much between two looks at a stage that stands
+SAME_PLACE_UM = 20
 
 
 class PlanRefusedError(Exception):
@@ -71,6 +74,29 @@ def plan_move(
         setpoints_um,
         (float(displacement[0]), float(displacement[1])),
     )
+
+
+def why_void(
+    from_um: Mapping[str, int],
+    rests_on: int | None,
+    positions_um: Mapping[str, int],
+    newest_measurement_id: int | None,
+) -> str:
+    """Say why a plan may not be carried out any more; empty if it may."""
+    for axis, planned_um in from_um.items():
+        at_um = positions_um.get(axis)
+        if at_um is None or not abs(at_um - planned_um) <= SAME_PLACE_UM:
+            return (
+                f"the plan was made where axis {axis} stood at {planned_um / 1000:.3f} mm, now it "
+                f"stands at {'nowhere known' if at_um is None else f'{at_um / 1000:.3f} mm'}"
+            )
+    newer = rests_on is not None and (newest_measurement_id or 0) > rests_on
+    if newer:
+        return (
+            f"the plan rests on measurement {rests_on}, there is a newer one "
+            f"({newest_measurement_id})"
+        )
+    return ""
 
 
 def check_travel(setpoints_um: Mapping[str, int], travel: Mapping[str, Travel]) -> None:

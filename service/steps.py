@@ -17,7 +17,8 @@ class MoveTo:
     """Go to absolute setpoints and settle: ends the hold before, begins a new one.
 
     shift_px is the displacement of the fiducial (row, col) that this place has from the reference
-    of its shift set; rests_on names the measurement that the plan was made from.
+    of its shift set; rests_on names the measurement that the plan was made from, from_um where the
+    robot stood then: elsewhere, or after a newer measurement, the plan is void.
     """
 
     setpoints_um: Mapping[str, int]
@@ -27,6 +28,7 @@ class MoveTo:
     place: int = 0
     shift_px: tuple[float, float] = (0.0, 0.0)
     shift_um: Mapping[str, int] = field(default_factory=dict)
+    from_um: Mapping[str, int] | None = None
 
 
 @dataclass(frozen=True)

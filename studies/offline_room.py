@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 from case_record.rows import SliceRow
 from robot_bridge.pmd_protocol import MICROSTEPS_PER_STEP
 from service.measuring import measure_request, measured_from_result
+from service.plan import PLAN_VOID, why_void
 from service.plane import ImagePlane
 from service.sensing import ABORT
 from service.steps import (
@@ -197,6 +198,11 @@ class OfflineRoom:
         return Answered(self._answer(step), "operator")
 
     def _move(self, step: MoveTo) -> Moved:
+        if step.from_um is not None:
+            void = why_void(step.from_um, step.rests_on, self.setpoints_um, self._measurements)
+            if void:
+                hold_id = max(self._slices)
+                return Moved("REFUSED", PLAN_VOID, void, hold_id, dict(self.setpoints_um))
         self.moves.append(dict(step.setpoints_um))
         reached = 1.0
         if self.stop_next_moves:

@@ -1,0 +1,116 @@
+"""kill -9 of any process at any instant: the case goes on, and nothing moves that nobody asked for.
+
+The motions are watched from outside, at the motors' truth port, through every start and every kill.
+"""
+
+import contextlib
+import os
+import random
+import signal
+import threading
+import time
+import tomllib
+from pathlib import Path
+
+import pytest
+
+from case_record.record import CaseRecord
+from simulator.truth_client import TruthAddress
+from simulator.unintended import TrueMotion, ask_motions, unintended_motions
+
+VICTIMS = {
+    "service": "command_line service",
+    "worker": "command_line worker",
+    "listener": "command_line listener",
+    "scanner": "command_line scanner",
+    "bridge": "robot_bridge",
+    "motors": "simulator.motors",
+    "serial line": "simulator.serial_line",
+}
+DEMO = "the demo itself"
+
+
+class MotionWatch:
+    """Keeps every motion that the motors' process tells of while a demo runs."""
+
+    def __init__(self, case_dir: Path) -> None:
+        self._config = case_dir / "room.toml"
+        self._over = threading.Event()
+        self._seen: dict[tuple[str, float], TrueMotion] = {}
+        self._thread = threading.Thread(target=self._watch, daemon=True)
+
+    def __enter__(self) -> dict[tuple[str, float], TrueMotion]:
+        self._thread.start()
+        return self._seen
+
+    def __exit__(self, *_: object) -> None:
+        self._over.set()
+        self._thread.join()
+
+    def _watch(self) -> None:
+        while not self._over.wait(0.1):
+            with contextlib.suppress(OSError, ValueError, KeyError):
+                table = tomllib.loads(self._config.read_text())
+                port = table["virtual"]["scanner"]["motors_truth_port"]
+                for motion in ask_motions(TruthAddress("127.0.0.1", port)):
+                    self._seen[(motion.axis, motion.start_s)] = motion
+
+
+def kill_at_random(demo, case_dir, dice, punctures, reach_s) -> str | None:
+    """Run the demo and kill one of its processes; None if it was done before."""
+    running = demo("--exit", "--punctures", str(punctures), "--seed", "5", case_dir=case_dir)
+    victim = dice.choice([*VICTIMS, DEMO])
+    pid = running.process.pid if victim == DEMO else running.pid_of(VICTIMS[victim])
+    running.pid_of(VICTIMS["scanner"])  # the last one to be started
+    deadline_s = time.monotonic() + dice.uniform(0.0, reach_s)
+    while time.monotonic() < deadline_s:
+        running.look()
+        if running.process.poll() is not None:
+            break
+        time.sleep(0.02)
+    with contextlib.suppress(ProcessLookupError):
+        os.kill(pid, signal.SIGKILL)
+    ended = running.ended(60.0)
+    assert "Traceback" not in ended.err
+    assert "still moved" not in ended.err
+    running.assert_nothing_left(10.0)
+    return None if ended.code == 0 else victim
+
+
+def campaign(demo, case_dir, seed, kills, punctures, reach_s) -> list[str]:
+    """Kill, restart, kill again; then let the case come to its end. Return who was killed."""
+    dice = random.Random(seed)
+    victims = []
+    with MotionWatch(case_dir) as motions:
+        for _ in range(kills):
+            victim = kill_at_random(demo, case_dir, dice, punctures, reach_s)
+            if victim is None:
+                break
+            victims.append(victim)
+        last = demo("--exit", "--punctures", str(punctures), "--seed", "5", case_dir=case_dir)
+        ended = last.ended(240.0)
+    assert ended.code == 0, f"after {victims}: {ended.err[-1500:]}"
+    results = ended.results()
+    assert len(results["punctures"]) == punctures
+    assert all(one["true_error_mm"] <= 0.10 for one in results["punctures"])
+    assert results["unintended_motions"] == 0
+    with CaseRecord(case_dir) as record:
+        assert record.verify_events() > 20
+        assert motions, "the watch saw nothing"
+        assert unintended_motions(list(motions.values()), record.moves()) == []
+    return victims
+
+
+def test_a_case_goes_on_after_random_kills(demo, tmp_path):
+    assert campaign(demo, tmp_path / "case", seed=1, kills=1, punctures=1, reach_s=6.0)
+
+
+@pytest.mark.soak
+def test_soak_fifty_kills_over_ten_cases(demo, tmp_path):
+    killed: list[str] = []
+    number = 0
+    while len(killed) < 50:
+        case_dir = tmp_path / f"case-{number}"
+        killed += campaign(demo, case_dir, 100 + number, kills=5, punctures=3, reach_s=25.0)
+        number += 1
+    assert len(set(killed)) >= 5
