@@ -131,8 +131,7 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             inbox_folder(config.room.case_dir),
             min_free_bytes=config.listener.min_free_mib * _MIB,
         )
-        intake = Intake(record, inbox, intake_rules(config, time.time()), metrics)
-        stack.callback(intake.close)
+        rules = intake_rules(config, time.time())
         scp = open_scp(config.listener, inbox, metrics, received.put)
         stack.callback(scp.stop)
         # Only now: who holds the port is the only one to write into this inbox.
@@ -146,6 +145,9 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             stack.callback(stop_metrics)
         scp.start()
         on_ready(Ready(scp.port, metrics_port, config.listener.ae_title))
+        # Receiving needs no memory of the case: a long record must not keep a scanner waiting.
+        intake = Intake(record, inbox, rules, metrics)
+        stack.callback(intake.close)
         if discarded:
             intake.alarm("unfinished_files", f"{discarded} unanswered files of an earlier run")
         left_over = intake.left_over()

@@ -10,8 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from robot_bridge import rules
-from robot_bridge.journal import CommandRecord, Journal, JournalError, LatchedStop
-from robot_bridge.link import (
+from robot_bridge.bridge_end import (
     BridgeEnd,
     HeartbeatReceived,
     MalformedReceived,
@@ -19,6 +18,7 @@ from robot_bridge.link import (
     SessionOpened,
     StopReceived,
 )
+from robot_bridge.journal import CommandRecord, Journal, JournalError, LatchedStop
 from robot_bridge.messages import (
     PROTOCOL_VERSION,
     SCHEMA,
@@ -39,13 +39,12 @@ from robot_bridge.messages import (
     SetPhase,
     Status,
 )
+from robot_bridge.motor_watch import MotorWatch
 from robot_bridge.motors import MotorError, Motors, MotorStatus
 from robot_bridge.phases import ALLOWED, WorkPhase
 
 IDLE_POLL_S = 0.2
-STOP_AGAIN_S = 0.1
 STANDSTILL_BOUND_S = 3.0
-PARK_AGAIN_S = 1.0
 
 
 @dataclass(frozen=True)
@@ -95,8 +94,7 @@ class Bridge:
         self.refused: Counter[str] = Counter()
         self.commands_done: Counter[str] = Counter()
         self.last_motion = f"boot:{boot_id}"
-        self.motor_status = motors.poll()
-        self._motors = motors
+        self.motors = MotorWatch(motors, clock)
         self._journal = journal
         self._clock = clock
         self._wall_clock = wall_clock
@@ -108,10 +106,6 @@ class Bridge:
         self._last_stop_nonce: int | None = None
         self._fresh_s = clock()
         self._ticked_s = clock()
-        self._polled_s = clock()
-        self._stopped_motors_s = clock()
-        self._parked_s = clock()
-        self._stop_unconfirmed = False
         self._close_old_commands()
 
     # --- what others may ask ------------------------------------------------------------------
@@ -122,7 +116,7 @@ class Bridge:
 
     @property
     def certain(self) -> bool:
-        return self._certain and self.motor_status.certain
+        return self._certain and self.motors.status.certain
 
     @property
     def insertion_locked(self) -> bool:
@@ -136,7 +130,7 @@ class Bridge:
         return self.end.take_output()
 
     def status(self) -> Status:
-        motors, command = self.motor_status, self._last_command
+        motors, command = self.motors.status, self._last_command
         return Status(
             now_ms=self._now_ms(),
             boot_id=self.boot_id,
@@ -184,8 +178,8 @@ class Bridge:
         known = self.stopped and stop.nonce == self._last_stop_nonce
         if known and stop.emergency:
             known = self.phase is WorkPhase.EMERGENCY
-        if not known or self._stop_unconfirmed:
-            self._stop_motors()
+        if not known or self.motors.stop_unconfirmed:
+            self.motors.stop()
         self.end.acknowledge_stop(stop)
         if known:
             return
@@ -228,7 +222,7 @@ class Bridge:
         if isinstance(request, Move | Home):
             return self._answer_command(request)
         if isinstance(request, Rearm):
-            self._clear_motor_fault()
+            self.motors.clear_fault()
         broken = rules.refusal(self._standing(request), request)
         if broken is not None:
             self._note("refused", request=type(request).__name__, code=broken[0].value)
@@ -256,7 +250,7 @@ class Bridge:
             insertion_locked=self.insertion_locked,
             in_flight=self._motion.record.command_id if self._motion else None,
             certain=self.certain,
-            fault=self.motor_status.fault,
+            fault=self.motors.status.fault,
             last_motion=self.last_motion,
             measurement_used=measurement in self._journal.measurements_used,
             now_ms=self._now_ms(),
@@ -295,11 +289,11 @@ class Bridge:
         self._journal.lock(request.locked, request.by, self._wall_clock())
 
     def _declare(self, request: DeclarePosition) -> None:
-        self._motors.declare_position(request.positions_um)
+        self.motors.motors.declare_position(request.positions_um)
         self._certain = True
         self._declared += 1
         self.last_motion = f"declared:{self.boot_id}:{self._declared}"
-        self.motor_status = self._poll_motors()
+        self.motors.poll()
         self._note("declare", positions_um=request.positions_um, by=request.by)
 
     # --- commands -----------------------------------------------------------------------------
@@ -353,7 +347,7 @@ class Bridge:
 
     def stop_for(self, code: Code, text: str) -> None:
         """Stop and latch for a reason of our own (deadman, guardian, line, motors)."""
-        self._stop_motors()
+        self.motors.stop()
         self._latch(code, text)
 
     def _begin_motion(self) -> None:
@@ -367,44 +361,46 @@ class Bridge:
         motion.record = replace(motion.record, state=CommandState.RUNNING)
         self._last_command = motion.record
         self.last_motion = motion.record.command_id
-        self._polled_s = self._clock()
+        self.motors.begun()
         try:
             if motion.record.what == "home":
-                self._motors.home()
+                self.motors.motors.home()
             else:
-                self._motors.move_to(motion.record.setpoints_um)
+                self.motors.motors.move_to(motion.record.setpoints_um)
         except MotorError as error:
-            self._stop_motors()
+            self.motors.stop()
             self._finish(CommandState.FAILED, Code.MOTOR_FAULT, str(error))
 
     def _follow_motors(self, now_s: float) -> None:
         period_s = IDLE_POLL_S if self._motion is None else self.settings.motion_poll_s
-        if now_s - self._polled_s < period_s:
+        if not self.motors.poll_if_due(period_s):
             return
-        self._polled_s = now_s
-        self.motor_status = self._poll_motors()
         homing = self._motion is not None and self._motion.record.what == "home"
-        if not self.motor_status.certain and not homing:
+        if not self.motors.status.certain and not homing:
             self._certain = False
         if self._motion is not None:
             self._follow_motion(self._motion, now_s)
-        elif self.motor_status.moving:
+        else:
+            self._follow_idle_motors()
+        if self.motors.stop_unconfirmed:
+            self.motors.stop_again_if_due()
+
+    def _follow_idle_motors(self) -> None:
+        if self.motors.status.moving:
             self._stop_stray_motion()
-        elif self.motor_status.fault is not None and self.armed:
-            self.stop_for(Code.MOTOR_FAULT, self.motor_status.fault_text)
-        if self.phase is WorkPhase.EMERGENCY and not self.motor_status.parked:
-            self._park_again(now_s)
-        if self._stop_unconfirmed and now_s - self._stopped_motors_s > STOP_AGAIN_S:
-            self._stop_motors()
+        elif self.motors.status.fault is not None and self.armed:
+            self.stop_for(Code.MOTOR_FAULT, self.motors.status.fault_text)
+        elif self.phase is WorkPhase.EMERGENCY:
+            self.motors.park_again_if_due()
 
     def _stop_stray_motion(self) -> None:
         if self.stopped:
-            self._stop_motors()
+            self.motors.stop()
         else:
             self.stop_for(Code.MOTOR_FAULT, "an axis moves without a command")
 
     def _follow_motion(self, motion: _Motion, now_s: float) -> None:
-        status = self.motor_status
+        status = self.motors.status
         if motion.ending is not None:
             self._await_standstill(motion, now_s)
         elif status.fault is not None:
@@ -424,12 +420,12 @@ class Bridge:
 
     def _await_standstill(self, motion: _Motion, now_s: float) -> None:
         assert motion.ending is not None
-        if not self.motor_status.moving:
+        if not self.motors.status.moving:
             self._finish(*motion.ending)
         elif now_s - motion.ending_s > STANDSTILL_BOUND_S:
             self._finish(CommandState.FAILED, Code.MOTOR_FAULT, "the motors do not stop")
-        elif now_s - self._stopped_motors_s > STOP_AGAIN_S:
-            self._stop_motors()
+        else:
+            self.motors.stop_again_if_due()
 
     # --- ends ---------------------------------------------------------------------------------
 
@@ -437,7 +433,7 @@ class Bridge:
         """Stop the motion in flight, if any, and decide how it will have ended (first one wins)."""
         if self._motion is None:
             return
-        self._stop_motors()
+        self.motors.stop()
         self._decide_end(state, code, text)
 
     def _decide_end(self, state: CommandState, code: Code, text: str) -> None:
@@ -453,8 +449,8 @@ class Bridge:
         self.stop_count += 1
         emergency = emergency or self.phase is WorkPhase.EMERGENCY
         self.phase = WorkPhase.EMERGENCY if emergency else WorkPhase.STOP
-        if emergency:
-            self._park_motors()
+        if emergency and (problem := self.motors.park()) is not None:
+            self._note("park_failed", text=problem)
         latched = LatchedStop(self.stop_count, code.value, emergency, True)
         try:
             self._journal.latch_stop(latched, text, self._wall_clock())
@@ -469,7 +465,7 @@ class Bridge:
             state=state,
             code=str(code),
             text=text[:TEXT_MAX],
-            readback_um=dict(self.motor_status.readback_um),
+            readback_um=dict(self.motors.status.readback_um),
         )
         if state is CommandState.DONE and record.what == "home":
             self._certain = True
@@ -485,39 +481,6 @@ class Bridge:
         self._last_command = record
         self.commands_done[record.state.value] += 1
 
-    def _stop_motors(self) -> None:
-        self._stopped_motors_s = self._clock()
-        try:
-            self._motors.stop()
-            self._stop_unconfirmed = False
-        except MotorError:
-            self._stop_unconfirmed = True  # tried again every STOP_AGAIN_S
-
-    def _park_again(self, now_s: float) -> None:
-        # A stop that came after the parking began has cut it short.
-        if self._motion is None and now_s - self._parked_s > PARK_AGAIN_S:
-            self._park_motors()
-
-    def _park_motors(self) -> None:
-        self._parked_s = self._clock()
-        try:
-            self._motors.park()
-        except MotorError as error:
-            self._note("park_failed", text=str(error))
-
-    def _clear_motor_fault(self) -> None:
-        if self.motor_status.fault is not None:
-            self._stop_motors()
-            self.motor_status = self._poll_motors()
-
-    def _poll_motors(self) -> MotorStatus:
-        try:
-            return self._motors.poll()
-        except MotorError as error:
-            return replace(
-                self.motor_status, certain=False, fault=error.code, fault_text=error.text
-            )
-
     def _close_old_commands(self) -> None:
         """What the last run left unfinished will never be done: say so, for ever."""
         for record in self._journal.unfinished():
@@ -530,7 +493,7 @@ class Bridge:
     def shut_down(self) -> None:
         """Stop and give the command in flight its end. Idempotent; each step on its own."""
         self.armed = False
-        self._stop_motors()
+        self.motors.stop()
         self._decide_end(CommandState.STOPPED, Code.SHUTTING_DOWN, "the bridge shut down")
 
     # --- small things -------------------------------------------------------------------------

@@ -7,13 +7,31 @@ from inside `pump` and the calls that block (`open`, `move`, ...), never from a 
 
 import contextlib
 import secrets
-import threading
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 
-from robot_bridge import framing, messages
-from robot_bridge.link import (
+from robot_bridge import messages
+from robot_bridge.client_values import (
+    BridgeError,
+    BridgeStatus,
+    Hello,
+    IncompatibleError,
+    LinkCounters,
+    LinkLostError,
+    MoveOutcome,
+    RefusedError,
+    hello_of,
+    status_of,
+)
+from robot_bridge.messages import (
+    SETPOINT_MAX_UM,
+    Code,
+    CommandState,
+    Heartbeat,
+    MessageError,
+)
+from robot_bridge.phases import WorkPhase
+from robot_bridge.service_end import (
     Answered,
     GaveUp,
     HelloReceived,
@@ -23,120 +41,24 @@ from robot_bridge.link import (
     StatusReceived,
     StopAcknowledged,
 )
-from robot_bridge.messages import (
-    SETPOINT_MAX_UM,
-    AxisTravel,
-    Code,
-    CommandState,
-    Heartbeat,
-    MessageError,
-)
-from robot_bridge.phases import WorkPhase
+from robot_bridge.stopper import STOP_REPEAT_S, Stopper
 from robot_bridge.transport import SerialTransport, Transport, TransportError
 
+__all__ = [
+    "BridgeClient",
+    "BridgeError",
+    "BridgeStatus",
+    "Hello",
+    "IncompatibleError",
+    "LinkCounters",
+    "LinkLostError",
+    "MoveOutcome",
+    "RefusedError",
+]
+
 MOTION_HEARTBEAT_S = 0.05
-STOP_REPEAT_S = 0.02
 HELLO_PAUSE_S = 0.05
 CLOSE_WAIT_S = 1.0
-
-
-class BridgeError(Exception):
-    """Base of what the client raises."""
-
-
-class LinkLostError(BridgeError):
-    """The line cannot be opened, is silent, or its session ended: call `open` again.
-
-    The bridge stops by itself. What became of a command in flight is learned by asking for the
-    same command id after `open`.
-    """
-
-
-class IncompatibleError(BridgeError):
-    """The bridge speaks another protocol or message schema."""
-
-
-class RefusedError(BridgeError):
-    """The bridge refused a request; `code` names the rule, `text` says what was wrong."""
-
-    def __init__(self, code: str, text: str) -> None:
-        super().__init__(f"{code}: {text}")
-        self.code = code
-        self.text = text
-
-
-@dataclass(frozen=True)
-class Hello:
-    """What the bridge said of itself when the session was opened."""
-
-    axes: tuple[AxisTravel, ...]
-    boot_id: str
-    position_certain: bool
-    last_motion: str
-    protocol: int
-    schema: str
-    software: str
-    boot_id_changed: bool
-
-
-@dataclass(frozen=True)
-class BridgeStatus:
-    """The bridge as it last said it was, `age_s` seconds ago (field meanings: messages.Status)."""
-
-    age_s: float
-    phase: WorkPhase
-    armed: bool
-    stopped: bool
-    stop_reason: str
-    stop_count: int
-    insertion_locked: bool
-    moving: bool
-    parked: bool
-    positions_um: Mapping[str, int]
-    position_certain: bool
-    last_motion: str
-    boot_id: str
-    fault: str | None
-    command_id: str | None
-    command_state: CommandState | None
-    command_code: str
-    command_text: str
-    refused: int
-
-
-@dataclass(frozen=True)
-class MoveOutcome:
-    """How a command ended: DONE, REFUSED, STOPPED or FAILED, never anything in between.
-
-    readback_um: where the axes stood when it ended ({} if it was refused).
-    """
-
-    command_id: str
-    state: CommandState
-    code: str
-    text: str
-    readback_um: Mapping[str, int]
-
-    @property
-    def done(self) -> bool:
-        return self.state is CommandState.DONE
-
-
-@dataclass(frozen=True)
-class LinkCounters:
-    """Since the client was made. round_trip_s is smoothed; None before the first answer."""
-
-    frames_sent: int
-    frames_received: int
-    frames_bad: int
-    frames_resent: int
-    frames_stale: int
-    own_echoes: int
-    bridge_frames_bad: int
-    bridge_refused: int
-    sessions: int
-    stops_sent: int
-    round_trip_s: float | None
 
 
 class BridgeClient:
@@ -162,6 +84,10 @@ class BridgeClient:
         self._heartbeat_s = heartbeat_s
         self._deadman_s = deadman_s
         self._open_transport = open_transport or (lambda: SerialTransport(url, baud))
+        # STOP goes out even if another program has the line.
+        self._open_for_stop = open_transport or (
+            lambda: SerialTransport(url, baud, exclusive=False)
+        )
         self._clock = clock
         self._pause = pause
         self._end = ServiceEnd()
@@ -178,7 +104,7 @@ class BridgeClient:
         self._answer: messages.Answer | None = None
         self._sessions = 0
         self._random_bits = random_bits
-        self._stopper = _Stopper(self._write_stop, clock, random_bits, threaded=stop_thread)
+        self._stopper = Stopper(self._write_stop, clock, random_bits, threaded=stop_thread)
 
     # --- session ------------------------------------------------------------------------------
 
@@ -208,7 +134,7 @@ class BridgeClient:
         self._known_motion = hello.last_motion
         self._refresh()
         changed = boot_before is not None and boot_before != hello.boot_id
-        return _hello_of(hello, changed)
+        return hello_of(hello, changed)
 
     def _say_hello(self) -> None:
         if self._transport is None:
@@ -265,7 +191,7 @@ class BridgeClient:
         """The newest status. Raises LinkLostError before the first `open`."""
         if self._status is None:
             raise LinkLostError(f"{self._url}: no status yet; the session is not open")
-        return _status_of(self._status, self._clock() - self._status_s)
+        return status_of(self._status, self._clock() - self._status_s)
 
     @property
     def counters(self) -> LinkCounters:
@@ -374,7 +300,7 @@ class BridgeClient:
         if transport is not None:
             transport.write(encoded)
             return
-        transport = self._open_transport()
+        transport = self._open_for_stop()
         try:
             transport.write(encoded)
         finally:
@@ -563,81 +489,6 @@ class BridgeClient:
                 transport.close()
 
 
-class _Stopper:
-    """Repeats STOP until it is acknowledged.
-
-    The control thread repeats it as it pumps; a thread of the stopper's own does when the control
-    thread does not, whatever keeps it.
-    """
-
-    def __init__(
-        self,
-        write: Callable[[bytes], None],
-        clock: Callable[[], float],
-        random_bits: Callable[[int], int],
-        *,
-        threaded: bool,
-    ) -> None:
-        self.sent = 0
-        self._write = write
-        self._clock = clock
-        self._random_bits = random_bits
-        self._threaded = threaded
-        self._changed = threading.Condition()
-        self._pending: tuple[int, bool] | None = None
-        self._sent_s = 0.0
-        self._closed = False
-        self._thread: threading.Thread | None = None
-
-    @property
-    def pending(self) -> bool:
-        return self._pending is not None
-
-    def request(self, emergency: bool) -> None:
-        with self._changed:
-            if self._pending is not None:
-                emergency = emergency or self._pending[1]
-            self._pending = (self._random_bits(32), emergency)
-            self._sent_s = -1e9
-            if self._thread is None and self._threaded:
-                self._thread = threading.Thread(target=self._watch, name="stop", daemon=True)
-                self._thread.start()
-            self._changed.notify()
-        self.repeat_if_due()
-
-    def acknowledged(self, nonce: int) -> None:
-        with self._changed:
-            if self._pending is not None and self._pending[0] == nonce:
-                self._pending = None
-
-    def close(self) -> None:
-        with self._changed:
-            self._closed = True
-            self._changed.notify()
-
-    def repeat_if_due(self) -> None:
-        if self._pending is None:
-            return
-        with self._changed:
-            pending, now_s = self._pending, self._clock()
-            if pending is None or now_s - self._sent_s < STOP_REPEAT_S:
-                return
-            self._sent_s = now_s
-            self.sent += 1
-        # A line that is gone: the control loop finds out and opens it again; we keep trying.
-        with contextlib.suppress(TransportError):
-            self._write(framing.encode_stop(*pending))
-
-    def _watch(self) -> None:
-        while True:
-            with self._changed:
-                self._changed.wait_for(lambda: self._closed or self._pending is not None)
-                self._changed.wait_for(lambda: self._closed, timeout=STOP_REPEAT_S)
-                if self._closed:
-                    return
-            self.repeat_if_due()
-
-
 def _checked_um(positions_um: Mapping[str, int]) -> dict[str, int]:
     """Whole micrometres that fit the wire. Raises RefusedError (NaN, floats, huge numbers)."""
     for axis, value in positions_um.items():
@@ -647,41 +498,3 @@ def _checked_um(positions_um: Mapping[str, int]) -> dict[str, int]:
             )
             raise RefusedError(Code.MALFORMED, text)
     return dict(positions_um)
-
-
-def _hello_of(hello: messages.Hello, changed: bool) -> Hello:
-    return Hello(
-        axes=hello.axes,
-        boot_id=hello.boot_id,
-        position_certain=hello.position_certain,
-        last_motion=hello.last_motion,
-        protocol=hello.protocol,
-        schema=hello.schema,
-        software=hello.software,
-        boot_id_changed=changed,
-    )
-
-
-def _status_of(status: messages.Status, age_s: float) -> BridgeStatus:
-    state = status.command_state
-    return BridgeStatus(
-        age_s=age_s,
-        phase=WorkPhase(status.phase),
-        armed=status.armed,
-        stopped=status.stopped,
-        stop_reason=status.stop_reason,
-        stop_count=status.stop_count,
-        insertion_locked=status.insertion_locked,
-        moving=status.moving,
-        parked=status.parked,
-        positions_um=status.positions_um,
-        position_certain=status.position_certain,
-        last_motion=status.last_motion,
-        boot_id=status.boot_id,
-        fault=status.fault,
-        command_id=status.command_id,
-        command_state=CommandState(state) if state else None,
-        command_code=status.command_code,
-        command_text=status.command_text,
-        refused=status.refused,
-    )

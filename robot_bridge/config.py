@@ -8,7 +8,7 @@ micrometres in the program.
 import math
 import tomllib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -56,7 +56,11 @@ class AxisConfig:
 
 @dataclass(frozen=True)
 class BridgeConfig:
-    """link: the bridge's end of the line to the service; service_link: the service's end."""
+    """link: the bridge's end of the line to the service.
+
+    service_link: the service's end, for the engineer's commands; the service's own `bridge_link`
+    in the same file stands in for it.
+    """
 
     link: str
     link_baud: int
@@ -240,4 +244,9 @@ def load_bridge_config(path: Path) -> BridgeConfig:
         raise ConfigError(f"{path}: is not TOML: {error}") from error
     if "bridge" not in table:
         raise ConfigError(f"{path}: bridge: the table [bridge] is missing")
-    return bridge_config_from_table(table["bridge"], str(path))
+    config = bridge_config_from_table(table["bridge"], str(path))
+    service = table.get("service")
+    link = service.get("bridge_link") if isinstance(service, Mapping) else None
+    if config.service_link is None and isinstance(link, str):
+        return replace(config, service_link=link)
+    return config

@@ -282,9 +282,12 @@ def _start(
     exit_with_parent: bool,
 ) -> Daemon:
     try:
+        config.status_file.parent.mkdir(parents=True, exist_ok=True)
         journal = Journal(config.state_dir)
     except JournalError as error:
         raise StartError(str(error)) from error
+    except OSError as error:
+        raise StartError(f"{config.status_file}: cannot be written: {error.strerror}") from error
     motors = make_motors(config)
     try:
         motors.open()

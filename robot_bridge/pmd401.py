@@ -93,7 +93,7 @@ class PmdMotors:
         try:
             self._line_of(axis).run(procedure, f"{name} of axis {axis.config.name}", deadline_s)
         except PmdError as error:
-            raise MotorError(*_code_and_text(axis, error)) from error
+            raise MotorError(*self._note_error(axis, error)) from error
         except OSError as error:
             raise MotorError("port_failed", f"{axis.config.controller}: {error}") from error
 

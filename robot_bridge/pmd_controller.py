@@ -76,10 +76,9 @@ class PmdController:
         return bool(self.status & Status.PARKED)
 
     @property
-    def _arrival_um(self) -> float:
-        """How near counts as there: the stop range of the controller, or the tolerance."""
-        counts_um = (self.config.tolerance_counts + 1) * pmd_units.um_per_count(self.config)
-        return max(counts_um, float(self.config.tolerance_um))
+    def _jitter_um(self) -> float:
+        """How far two readings of a standing encoder may differ."""
+        return (self.config.tolerance_counts + 1) * pmd_units.um_per_count(self.config)
 
     def _named(self, text: str) -> str:
         return f"axis {self.config.name} (controller {self.address}): {text}"
@@ -126,7 +125,7 @@ class PmdController:
         yield from self._read_position()
         first_um = self.position_um
         yield from self._read_position()
-        if abs(self.position_um - first_um) > self._arrival_um:
+        if abs(self.position_um - first_um) > self._jitter_um:
             yield from self._read_position()
 
     def _check_status(self) -> Steps[None]:

@@ -7,6 +7,7 @@ is the exception and goes onto the line at once. Errors are RFC 9457 problem det
 from __future__ import annotations
 
 import asyncio
+import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
@@ -34,6 +35,7 @@ from service.routes_record import image_router, live_router, record_router
 
 PAGE = Path(__file__).parent / "page"
 _HOUR_S = 3600.0
+_LOOP_IS_OLD_S = 3.0
 
 
 def create_app(config: Config, announce: Callable[[], None] = lambda: None) -> FastAPI:
@@ -126,12 +128,19 @@ def parts_of(loop: ControlLoop) -> dict[str, str]:
     """Every part of the room: `ok`, or what is wrong with it."""
     state = loop.state
     parts = {
-        "control_loop": "ok" if loop.failure is None else f"ended: {loop.failure}",
+        "control_loop": _loop_health(loop),
         "robot": "ok" if state.robot.linked else state.robot.problem,
     }
     for process in state.processes:
         parts[process.name] = "ok" if process.condition == "up" else process.detail
     return parts
+
+
+def _loop_health(loop: ControlLoop) -> str:
+    if loop.failure is not None:
+        return f"ended: {loop.failure}"
+    age_s = time.time() - loop.state.at_s
+    return "ok" if age_s < _LOOP_IS_OLD_S else f"has said nothing for {age_s:.0f} s"
 
 
 def _add_page(app: FastAPI) -> None:

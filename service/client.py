@@ -155,6 +155,9 @@ class RoomClient:
     def record_puncture(self, insertion_depth_mm: float | None = None) -> None:
         self._order("POST", "/api/v1/puncture", insertion_depth_mm=insertion_depth_mm)
 
+    def lock_motion(self) -> None:
+        self._order("POST", "/api/v1/lock")
+
     def needle_out(self) -> None:
         self._order("POST", "/api/v1/needle-out")
 

@@ -255,6 +255,17 @@ class Commands:
         }
         self._note("puncture", by, body)
 
+    def lock_motion(self, by: str) -> None:
+        """The needle is going in: no motion until the operator says that it is out."""
+        self._linked()
+        if self._record.running_procedure() is not None:
+            raise ConflictError("busy", "A procedure is running: end it before locking motion.")
+        try:
+            self._link.client.set_insertion_lock(True, by)
+        except BridgeError as error:
+            raise ConflictError("robot_refused", str(error)) from error
+        self._note("insertion_locked", by, {})
+
     def needle_out(self, by: str) -> None:
         """The needle is out: unlock motion."""
         status = self._linked()

@@ -214,7 +214,9 @@ def _answer(commands: Commands, asked: _Asked, moving: bool) -> None:
         if moving and asked.name not in _WHILE_MOVING:
             raise ConflictError("moving", "The robot moves: wait until it stands, or press STOP.")
         asked.future.set_result(getattr(commands, asked.name)(**asked.arguments))
+        log.info("command", command=asked.name, by=asked.arguments.get("by"))
     except (ConflictError, CaseRecordError) as error:
+        log.info("refused", command=asked.name, by=asked.arguments.get("by"), why=str(error))
         asked.future.set_exception(error)
     except Exception as error:
         log.exception("command failed", command=asked.name)

@@ -11,10 +11,13 @@ import asyncio
 import contextlib
 import json
 import threading
+import time
 from collections import deque
 from collections.abc import AsyncIterator
 
-from case_record.record import CaseRecord
+import structlog
+
+from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Event
 from room_config.load import Config
 from service.control import ControlLoop
@@ -22,9 +25,9 @@ from service.control import ControlLoop
 _WATCH_S = 0.01
 _LEAST_BETWEEN_STATES_S = 0.04
 _BEAT_S = 1.0
+_AGAIN_S = 1.0
 _KEPT_EVENTS = 1000
 _EVENTS_AT_ONCE = 500
-_BEAT = b"event: beat\ndata: {}\n\n"
 
 
 class Broadcast:
@@ -53,24 +56,32 @@ class Broadcast:
     # In the broadcast's own thread
 
     def _watch(self) -> None:
-        revision = -1
-        record: CaseRecord | None = None
-        while not self._closing.wait(_WATCH_S):
-            state = self._loop.state
-            if state.revision == revision or not state.case_uid:
-                continue
-            revision = state.revision
-            if record is None:
-                record = CaseRecord(self._case_dir)
+        while not self._closing.is_set():
+            try:
+                self._watch_record()
+            except CaseRecordError as error:
+                structlog.get_logger().error("event stream", error=str(error))
+                self._closing.wait(_AGAIN_S)
+
+    def _watch_record(self) -> None:
+        while not self._loop.state.case_uid:
+            if self._closing.wait(_WATCH_S):
+                return
+        with CaseRecord(self._case_dir) as record:
+            if not self._newest_id:
                 self._newest_id = max(0, record.last_event_id() - _KEPT_EVENTS)
-            events = record.events(self._newest_id) if state.event_id > self._newest_id else []
-            messages = [(event.event_id, _event_message(event)) for event in events]
-            if events:
-                self._newest_id = events[-1].event_id
-            self._tell(_state_message(state.model_dump_json()), messages)
-            self._closing.wait(_LEAST_BETWEEN_STATES_S)
-        if record is not None:
-            record.close()
+            revision = -1
+            while not self._closing.wait(_WATCH_S):
+                state = self._loop.state
+                if state.revision == revision:
+                    continue
+                revision = state.revision
+                events = record.events(self._newest_id) if state.event_id > self._newest_id else []
+                messages = [(event.event_id, _event_message(event)) for event in events]
+                if events:
+                    self._newest_id = events[-1].event_id
+                self._tell(_state_message(state.model_dump_json()), messages)
+                self._closing.wait(_LEAST_BETWEEN_STATES_S)
 
     def _tell(self, state_message: bytes, messages: list[tuple[int, bytes]]) -> None:
         assert self._server is not None
@@ -103,9 +114,14 @@ class Broadcast:
                 try:
                     await asyncio.wait_for(turn.wait(), _BEAT_S)
                 except TimeoutError:
-                    yield _BEAT
+                    yield self._beat()
         finally:
             self.viewers -= 1
+
+    def _beat(self) -> bytes:
+        """Tells how old the state is: a control loop that hangs is noticed on every screen."""
+        body = json.dumps({"at_s": self._loop.state.at_s, "now_s": time.time()})
+        return f"event: beat\ndata: {body}\n\n".encode()
 
     def _kept_since(self, after_id: int) -> tuple[bytes, int]:
         if not self._events or self._events[-1][0] <= after_id:

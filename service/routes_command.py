@@ -157,6 +157,11 @@ def command_router(loop: ControlLoop) -> APIRouter:
         """Record the puncture."""
         orders.carry_out(caller, key, "puncture", body)
 
+    @router.post("/api/v1/lock", tags=["procedure"], status_code=204, responses=_REFUSALS)
+    def lock(body: Ask, caller: Caller, key: Key = None) -> None:
+        """The needle is going in: lock motion by hand (READY locks it by itself)."""
+        orders.carry_out(caller, key, "lock_motion", body)
+
     @router.post("/api/v1/needle-out", tags=["procedure"], status_code=204, responses=_REFUSALS)
     def needle_out(body: Ask, caller: Caller, key: Key = None) -> None:
         """The needle is out: unlock motion."""

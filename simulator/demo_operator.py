@@ -6,6 +6,7 @@ case. What it writes down (one line a puncture) is compared with the truth of th
 
 from __future__ import annotations
 
+import contextlib
 import json
 import time
 from collections.abc import Callable
@@ -13,15 +14,16 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-import httpx
 import numpy as np
 
+from service.client import RefusedByServiceError, RoomClient, ServiceGoneError
 from simulator.config import VirtualRoom
 from simulator.scene import true_fiducial_mm
 from simulator.truth_client import TruthAddress, ask_where
 
 WHO = "virtual operator"
 _POLL_S = 0.05
+_NOT_NOW = 409
 _PATIENCE_S = 90.0
 _MOST_FAILURES = 4
 _TARGET_REACH_MM = 7.0
@@ -58,7 +60,7 @@ class Operator:
     def __init__(
         self, url: str, room: VirtualRoom, truth: TruthAddress, results_file: Path, seed: int
     ) -> None:
-        self._http = httpx.Client(base_url=url, timeout=10.0)
+        self._client = RoomClient(url, by=WHO)
         self._room = room
         self._truth = truth
         self._results_file = results_file
@@ -79,25 +81,23 @@ class Operator:
         while True:
             check()
             try:
-                self.state = self._get("/api/v1/state")
+                self.state = self._client.state().model_dump(mode="json")
                 look(self.state)
                 self._be_patient()
                 if not self._act(punctures):
                     return
-            except httpx.TransportError:
+            except ServiceGoneError:
                 # the service is gone or busy: `check` names a dead process in its next round
                 self._be_patient()
             time.sleep(_POLL_S)
 
     def close(self) -> None:
-        self._http.close()
+        self._client.close()
 
     def stop(self) -> None:
         """Press STOP, if anybody still listens."""
-        try:
-            self._http.post("/api/v1/stop", json={"by": WHO}, timeout=1.0)
-        except httpx.HTTPError:
-            return
+        with contextlib.suppress(ServiceGoneError, RefusedByServiceError):
+            self._client.stop()
 
     def _act(self, punctures: int) -> bool:
         """Do the next thing that a person would do; False when there is nothing left."""
@@ -106,7 +106,7 @@ class Operator:
         if not robot["linked"] or robot["moving"]:
             return True
         if robot["stopped"] or not robot["armed"] or not robot["position_certain"]:
-            self._post("/api/v1/reset")
+            self._order(self._client.reset)
         elif state["question"] is not None:
             self._answer(state["question"])
         elif state["procedure"] is not None:
@@ -117,11 +117,11 @@ class Operator:
             return False
         elif not state["calibrated"] or "calibrate again" in state["last_outcome"]:
             self._note_failure(state)
-            self._post("/api/v1/calibration")
+            self._order(self._client.start_calibration)
         else:
             self._note_failure(state)
             self._set_target(state)
-            self._post("/api/v1/approach")
+            self._order(self._client.start_approach)
         return True
 
     def _compare_clocks_if_slices_are_refused(self, request: dict[str, Any] | None) -> None:
@@ -145,7 +145,7 @@ class Operator:
         choice = next(
             c for c in ("confirm", "rescan", *question["choices"]) if c in question["choices"]
         )
-        self._post("/api/v1/answer", question_id=question["question_id"], choice=choice)
+        self._order(self._client.answer, question["question_id"], choice)
 
     def _puncture(self, state: dict[str, Any]) -> None:
         arrival = state["arrival"]
@@ -153,8 +153,8 @@ class Operator:
             return  # READY is complete only when motion is locked
         if all(r.procedure_id != arrival["procedure_id"] for r in self.results):
             self._write_result(self._result(arrival, state["target_patient_mm"]))
-            self._post("/api/v1/puncture")
-        self._post("/api/v1/needle-out")
+            self._order(self._client.record_puncture)
+        self._order(self._client.needle_out)
 
     def _result(self, arrival: dict[str, Any], target_mm: list[float]) -> PunctureResult:
         stages = ask_where(self._truth)
@@ -176,7 +176,7 @@ class Operator:
         rng = np.random.default_rng((self._seed, len(self.results)))
         along_x, along_z = rng.uniform(-_TARGET_REACH_MM, _TARGET_REACH_MM, 2).tolist()
         x, y, z = self._origin_mm(state)
-        self._put("/api/v1/target", patient_mm=[x + along_x, y, z + along_z])
+        self._order(self._client.set_target, (x + along_x, y, z + along_z))
 
     def _origin_mm(self, state: dict[str, Any]) -> tuple[float, float, float]:
         """Where the fiducial was seen at the end of the calibration; kept for later targets."""
@@ -216,19 +216,10 @@ class Operator:
             file.write(json.dumps(asdict(result)) + "\n")
         self.results.append(result)
 
-    def _get(self, path: str) -> dict[str, Any]:
-        answer = self._http.get(path)
-        answer.raise_for_status()
-        body: dict[str, Any] = answer.json()
-        return body
-
-    def _post(self, path: str, **body: Any) -> None:
-        self._accept(self._http.post(path, json={"by": WHO, **body}))
-
-    def _put(self, path: str, **body: Any) -> None:
-        self._accept(self._http.put(path, json={"by": WHO, **body}))
-
-    def _accept(self, answer: httpx.Response) -> None:
-        # 409: the room went on meanwhile; the next look at the state says how
-        if answer.status_code != 409:
-            answer.raise_for_status()
+    def _order(self, order: Callable[..., object], *arguments: object) -> None:
+        """Give an order; "not now" (409) is no failure: the next look at the state says how."""
+        try:
+            order(*arguments)
+        except RefusedByServiceError as error:
+            if error.status != _NOT_NOW:
+                raise DemoFailedError(f"the service refused an order: {error}") from error

@@ -34,8 +34,8 @@ from sr_engine.signal import (
 
 Array = NDArray[np.float64]
 
-_OUTLIER_SIGMA = 4.5
-_OUTLIER_NEIGHBOUR_SIGMA = 2.5
+OUTLIER_SIGMA = 4.5
+_NEIGHBOUR_SHARE = 0.55  # of that, for the neighbours of a pixel left out
 _MAX_ITERATIONS = 40
 _LONGEST_STEP_PX = 0.7  # of centre and radius
 _MAX_ROUNDS = 6
@@ -134,13 +134,15 @@ def fit_disc(
     noise: NoiseKind = "rician",
     sigma: float | None = None,
     robust: bool = True,
+    outlier_sigma: float = OUTLIER_SIGMA,
     whiten: bool = True,
 ) -> DiscFit:
     """Fit the object that starts at (row, col, radius), or like another fit.
 
     wall_px: expected thickness of a wall (shell) about the object; None for none.
     sigma: noise std per channel where it is known; otherwise it is taken from the residuals.
-    robust: leave out pixels that disagree with any round object (a bubble, a neighbour).
+    robust: leave out pixels that disagree with any round object (a bubble, a neighbour) by more
+      than outlier_sigma.
     whiten: allow for the colour that a k-space filter gives the noise; not where the model's own
       imperfection, and not noise, is what remains.
     Raises NotConvergedError when the fit does not settle or leaves radius_bounds_px.
@@ -155,11 +157,16 @@ def fit_disc(
     else:
         parameters, level = _linear_start(problem, start)
     level = level if sigma is None else sigma
+    least_spread = 1e-12 if sigma is None else 1.0  # of standardised residuals
     signal, _ = signal_of(parameters, pixels.patch, problem.model)
     for _ in range(_MAX_ROUNDS):
         metric = _metric(problem, signal, level)
         parameters, at = _levenberg_marquardt(problem, parameters, metric)
-        mask = _without_outliers(problem, pixels.mask, at, metric, sigma) if robust else pixels.mask
+        mask = (
+            _without_outliers(problem, pixels.mask, at, metric, least_spread, outlier_sigma)
+            if robust
+            else pixels.mask
+        )
         old = level
         if sigma is None:
             level = _next_sigma(problem, mask, at, level, float(abs(parameters[AMPLITUDE])))
@@ -204,14 +211,18 @@ def _next_sigma(
 
 
 def _without_outliers(
-    problem: _Problem, mask: Mask, at: _Linearised, metric: _Metric, known_sigma: float | None
+    problem: _Problem,
+    mask: Mask,
+    at: _Linearised,
+    metric: _Metric,
+    least_spread: float,
+    outlier_sigma: float,
 ) -> Mask:
     """The mask without pixels that no round object explains, and without their odd neighbours."""
     expected = moments(at.signal, metric.sigma, problem.noise)
     size = np.abs(problem.pixels.values - expected.mean) / np.sqrt(expected.variance)
-    spread = 1.4826 * float(np.median(size[mask]))
-    spread = max(spread, 1.0) if known_sigma is not None else max(spread, 1e-12)
-    out = mask & (size > _OUTLIER_SIGMA * spread)
+    limit = outlier_sigma * max(1.4826 * float(np.median(size[mask])), least_spread)
+    out = mask & (size > limit)
     if not out.any():
         return mask
     padded = np.pad(out, 1)
@@ -220,7 +231,7 @@ def _without_outliers(
     for i in range(3):
         for j in range(3):
             near |= padded[i : i + rows, j : j + cols]
-    keep = mask & ~out & ~(near & (size > _OUTLIER_NEIGHBOUR_SIGMA * spread))
+    keep = mask & ~out & ~(near & (size > _NEIGHBOUR_SHARE * limit))
     return keep if keep.sum() > 0.5 * mask.sum() else mask
 
 

@@ -23,7 +23,18 @@ Array = NDArray[np.float64]
 START_RADII = (0.75, 0.85, 0.95, 1.0, 1.05, 1.15, 1.25, 1.4)  # of the candidate's
 START_WALLS_PX = (None, 1.2, 2.2)
 START_MARGIN_PX = 6.0
+PSFS = (
+    Psf("flat"),
+    Psf("elliptical"),
+    Psf("fermi"),
+    Psf("hamming"),
+    Psf("hamming", acquired=(0.75, 0.75)),
+    Psf("hamming", acquired=(0.6, 0.6)),
+)
+PSF_RADII_PX = (-0.25, 0.0, 0.25)  # about the start's radius, which depends on the point spread
+PSF_OBJECTS = 3  # of a slice, that its point spread is judged by
 RADIUS_FREEDOM = (0.6, 1.6)  # of the start's radius
+GROSS_SIGMA = 8.0  # pixels are left out beyond it: a bubble is, an imperfect model is not
 FARTHEST_PX = 2.0  # that a fit may go from its candidate, or a third of the radius if that is more
 
 
@@ -64,7 +75,7 @@ def locate_all(
     """Every round object of a frame of magnitude pixels (rows, cols), strongest first.
 
     radius_px: (low, high) or one number within 25 %; default 2 to 40 px. roi: (row0, col0, row1,
-    col1) bounds of the centres. psf: point spread, flat k-space by default.
+    col1) bounds of the centres. psf: point spread; by default the likeliest of `PSFS`.
     Raises NoRoundObjectError where nothing round is seen, or nothing that is seen can be fitted
     (the message says which and why); ConstantFrameError, NotFiniteError, ShapeError,
     ParameterError for input that is none.
@@ -73,16 +84,35 @@ def locate_all(
     candidates = detect(image, radius_px, max_objects=max_objects, roi=roi)
     if not candidates:
         raise NoRoundObjectError("no round object of the allowed size stands out from the slice")
+    psf = psf or likeliest_psf(image, candidates[:PSF_OBJECTS])
     found: list[Located] = []
     refusals: list[str] = []
     for candidate in candidates:
         try:
-            found.append(refine(image, candidate, psf or Psf()))
+            found.append(refine(image, candidate, psf))
         except EngineError as error:
             refusals.append(str(error))
     if not found:
         raise NoRoundObjectError(f"{len(refusals)} round objects seen, none fits: {refusals[0]}")
     return found
+
+
+def likeliest_psf(image: Array, candidates: list[Candidate]) -> Psf:
+    """The point spread through which the candidates of a slice are explained best together."""
+    scores = np.zeros(len(PSFS))
+    for candidate in candidates:
+        radius, wall_px = _best_starts(image, candidate, PSFS[0])[0]
+        outer = radius + (wall_px or 0.0)
+        try:
+            pixels = region_of_interest(image, (*candidate.centre_px, outer), PSFS[0])
+        except EngineError:
+            continue
+        for i, psf in enumerate(PSFS):
+            left = min(
+                _misfit(pixels, psf, candidate.centre_px, radius + d, wall_px) for d in PSF_RADII_PX
+            )
+            scores[i] += np.count_nonzero(pixels.mask) * np.log(left)
+    return PSFS[int(np.argmin(scores))]
 
 
 def refine(image: Array, candidate: Candidate, psf: Psf) -> Located:
@@ -110,6 +140,7 @@ def _fit(
         radius_bounds_px=(RADIUS_FREEDOM[0] * radius, RADIUS_FREEDOM[1] * radius),
         wall_px=wall_px,
         noise=noise_kind(image, psf),
+        outlier_sigma=GROSS_SIGMA,
         whiten=False,  # on real slices the model's own imperfection is what remains
     )
     moved = float(np.hypot(*(fit.centre_px - candidate.centre_px)))

@@ -17,8 +17,7 @@ from dicom_listener.pixels import magnitude_pixels
 from dicom_listener.reasons import UnusableError
 from sr_engine.detect import Candidate, detect
 from sr_engine.errors import EngineError
-from sr_engine.locate import refine
-from sr_engine.psf import Psf
+from sr_engine.locate import likeliest_psf, refine
 from studies.peers import PEERS, PeerFailedError, run_peer
 
 Array = NDArray[np.float64]
@@ -151,7 +150,7 @@ def displaced(frame: Array, move_px: Array) -> Array:
 
 def _centre(name: str, frame: Array, seen: Candidate) -> Array:
     if name == OURS:
-        return refine(frame, seen, Psf()).centre_px
+        return refine(frame, seen, likeliest_psf(frame, [seen])).centre_px
     return run_peer(PEERS[name], frame, seen.centre_px, seen.radius_px)
 
 

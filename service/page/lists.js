@@ -93,6 +93,7 @@ export const drawJog = whenChanged(({ positions_um, possible }) => {
     return h("div", { class: "row" }, h("b", {}, axis), button(-STEPS_MM[0]), button(-STEPS_MM[1]),
       h("output", {}, `${mm(um / 1000, 3)} mm`), button(STEPS_MM[1]), button(STEPS_MM[0]));
   });
-  replace(byId("jog-body"), rows.length ? rows : "No link to the robot.",
+  const lock = h("p", {}, h("button", { type: "button", disabled: !possible, onclick: () => act(() => order("POST", "/api/v1/lock")) }, "Lock motion for the needle"));
+  replace(byId("jog-body"), rows.length ? [...rows, lock] : "No link to the robot.",
     possible ? null : h("p", { class: "quiet" }, "Only while no procedure runs, the robot is armed and not locked."));
 });

@@ -2,6 +2,8 @@
 // second, so that silence is noticed even when the connection looks open.
 
 const SILENT_MS = 2500;
+// the service answers, but its control loop has not said anything for so long
+const OLD_S = 3;
 
 export class Live {
   constructor({ onState, onEvent, onUp, onDown }) {
@@ -23,7 +25,11 @@ export class Live {
       this.lastId = Number(message.lastEventId) || this.lastId;
       this.on.onEvent(JSON.parse(message.data));
     }));
-    source.addEventListener("beat", () => this.heard(() => {}));
+    source.addEventListener("beat", (message) => {
+      const { at_s: atS, now_s: nowS } = JSON.parse(message.data);
+      if (nowS - atS > OLD_S) this.lost(nowS - atS);
+      else this.heard(() => {});
+    });
     source.onerror = () => this.lost();
   }
 
@@ -37,16 +43,15 @@ export class Live {
     act();
   }
 
-  lost() {
-    if (this.isUp) this.failedMs = performance.now();
+  lost(ageS = (performance.now() - this.heardMs) / 1000) {
     this.isUp = false;
     this.failures += 1;
-    this.on.onDown((performance.now() - this.heardMs) / 1000, this.failures);
+    this.on.onDown(ageS, this.failures);
   }
 
   watch() {
     const silentMs = performance.now() - this.heardMs;
-    if (silentMs > SILENT_MS) this.lost();
+    if (silentMs > SILENT_MS) this.lost(silentMs / 1000);
     // the browser gives up on some errors (a 401, a proxy's 502): ask again ourselves
     if (this.source?.readyState === EventSource.CLOSED || silentMs > 4 * SILENT_MS) {
       this.heardMs = Math.max(this.heardMs, performance.now() - 3 * SILENT_MS);

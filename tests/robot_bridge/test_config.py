@@ -105,3 +105,14 @@ def test_a_file_that_is_missing_broken_or_without_the_table_is_named(tmp_path: P
         load_bridge_config(file)
     file.write_text(GOOD)
     assert load_bridge_config(file).link == "/dev/ttyUSB0"
+
+
+def test_the_services_own_end_of_the_line_is_found_in_the_same_file(tmp_path: Path):
+    file = tmp_path / "room.toml"
+    file.write_text(GOOD)
+    assert load_bridge_config(file).service_link is None
+    file.write_text(GOOD + '[service]\nbridge_link = "/dev/ttyS9"\n')
+    assert load_bridge_config(file).service_link == "/dev/ttyS9"
+    text = GOOD.replace("[bridge]", '[bridge]\nservice_link = "/dev/ttyS8"')
+    file.write_text(text + '[service]\nbridge_link = "/dev/ttyS9"\n')
+    assert load_bridge_config(file).service_link == "/dev/ttyS8"

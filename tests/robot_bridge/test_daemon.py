@@ -14,6 +14,7 @@ from bridge_room import AXES, BridgeRoom, bridge_room, wait_for
 from robot_bridge.client import LinkLostError, MoveOutcome, RefusedError
 from robot_bridge.messages import CommandState
 from robot_bridge.phases import WorkPhase
+from simulator.serial_line import LineFaults
 
 FAR = dict.fromkeys(AXES, 14_000)  # about two seconds at full speed
 
@@ -53,6 +54,20 @@ def test_moves_arrive_where_they_were_sent(shared_room: BridgeRoom):
     truth = room.controllers.positions_um()
     assert truth == pytest.approx({"xt": 1000, "yt": -2000, "xb": 500, "yb": 0}, abs=20)
     assert outcome.readback_um == pytest.approx(truth, abs=5)
+
+
+def test_on_a_line_that_loses_a_fifth_of_the_frames_moves_arrive_all_the_same(
+    shared_room: BridgeRoom,
+):
+    room = shared_room
+    client = room.ready_client()
+    room.line.set_faults(LineFaults(loss=0.2, bit_flip=0.02, duplicate=0.05))
+    for number in range(8):
+        setpoints_um = dict.fromkeys(AXES, 200 * (number % 3))
+        outcome = client.move(room.id(f"{number}"), setpoints_um, None)
+        assert outcome.done, outcome
+        assert room.controllers.positions_um() == pytest.approx(setpoints_um, abs=20)
+    assert client.counters.frames_resent > 0
 
 
 def test_stop_during_motion_stands_within_100_ms(shared_room: BridgeRoom):
@@ -241,6 +256,15 @@ def test_without_a_controller_the_daemon_says_which_port_and_exits_3(tmp_path: P
         last = room.log.strip().splitlines()[-1]
         assert last.startswith("autospine bridge: ")
         assert "/dev/no-such-port" in last
+        assert "Traceback" not in room.log
+
+
+def test_a_status_file_that_cannot_be_written_is_named_and_exit_3(tmp_path: Path):
+    extra = f'status_file = "{tmp_path}/room.toml/status.json"'
+    with bridge_room(tmp_path, extra=extra) as room:
+        daemon = room.start_daemon()
+        assert daemon.wait(10) == 3
+        assert "room.toml/status.json: cannot be written" in room.log
         assert "Traceback" not in room.log
 
 

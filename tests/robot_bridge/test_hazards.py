@@ -379,3 +379,16 @@ def test_h13_stop_gets_through_while_the_control_thread_hangs_on_a_bad_line(
     outcome = client.move(room.id("a"), FAR, None, hang)
     assert moving_after_600_ms[0] is False
     assert outcome.code == "operator_stop", outcome
+
+
+def test_h13_stop_gets_through_without_an_open_session_of_ones_own(shared_room: BridgeRoom):
+    """The service lost its session; another program even has the line."""
+    room = shared_room
+    other = room.ready_client()
+    service = room.client()
+    service.request_stop()
+    wait_for(lambda: other.pump(0.02) or other.status.stopped, 2, "the stop")
+    assert other.status.stop_reason == "operator_stop"
+    other.close()
+    service.open(5.0)
+    wait_for(lambda: service.pump(0.02) or service.stop_acknowledged, 2, "the acknowledgement")

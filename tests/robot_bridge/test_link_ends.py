@@ -5,18 +5,8 @@ import itertools
 import pytest
 
 from robot_bridge import framing
+from robot_bridge.bridge_end import BridgeEnd, MalformedReceived, RequestReceived, SessionOpened
 from robot_bridge.framing import Deframer, Frame, FrameCounters
-from robot_bridge.link import (
-    TRIES_MAX,
-    Answered,
-    BridgeEnd,
-    GaveUp,
-    MalformedReceived,
-    RequestReceived,
-    ServiceEnd,
-    SessionLost,
-    SessionOpened,
-)
 from robot_bridge.messages import (
     PROTOCOL_VERSION,
     SCHEMA,
@@ -26,6 +16,7 @@ from robot_bridge.messages import (
     HelloRequest,
     pack,
 )
+from robot_bridge.service_end import TRIES_MAX, Answered, GaveUp, ServiceEnd, SessionLost
 
 
 def hello_of(nonce: int):

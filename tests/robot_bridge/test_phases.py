@@ -15,7 +15,7 @@ from axis_model import AXES
 from virtual_room import VirtualRoom
 
 from robot_bridge.bridge import Bridge
-from robot_bridge.link import RequestReceived, SessionOpened, StopReceived
+from robot_bridge.bridge_end import RequestReceived, SessionOpened, StopReceived
 from robot_bridge.messages import (
     Arm,
     Code,
@@ -108,7 +108,7 @@ class Bench:
             self.ask(SetInsertionLock(True, "test", self.now_ms))
         if case.fault:
             self.room.motors.fault = "encoder"
-            self.bridge.motor_status = self.room.motors.poll()
+            self.bridge.motors.poll()
         status = self.bridge.status()
         reached = Case(
             WorkPhase(status.phase),

@@ -1,16 +1,14 @@
 """Where the manuals are silent or contradicted, the driver works with either answer, unchanged."""
 
 import itertools
-import time
 
 import pytest
-from pmd_rig import axis_config, finish, opened, rig, wait_until
+from pmd_rig import finish, opened, rig, wait_until
 from virtual_line import VirtualLine
 
 from robot_bridge.emulator_axis import Motor
 from robot_bridge.emulator_switches import Switches
 from robot_bridge.motors import POLL_BOUND_S, STOP_BOUND_S
-from robot_bridge.pmd401 import PmdMotors
 
 SINGLE = [
     Switches(terminator="cr"),
@@ -115,30 +113,25 @@ def test_stop_gets_through_although_it_collides_with_an_answer(into_the_answer_s
 @pytest.mark.parametrize("latency_s", [0.001, 0.016])
 def test_four_axes_on_one_bus_behind_a_slow_adapter(latency_s: float):
     names = ("xt", "yt", "xb", "yb")
-    with rig((1, 2, 3, 4), speed_factor=2.0) as made:
-        made.bus.faults.reply_delay_s = latency_s
-        axes = [axis_config(name, made.url, k) for k, name in enumerate(names, 1)]
-        motors = PmdMotors(axes)
-        motors.open()
-        motors.declare_position(dict.fromkeys(names, 0))
-        longest_s, moving = 0.0, True
-        motors.move_to({name: 1000 * k for k, name in enumerate(names, 1)})
-        while moving:
-            begun_s = time.monotonic()
-            status = motors.poll()
-            longest_s = max(longest_s, time.monotonic() - begun_s)
-            moving = status.moving
-            time.sleep(0.005)
-        assert status.reached, status
-        assert longest_s < POLL_BOUND_S
-        assert [made.position_um(k) for k in (1, 2, 3, 4)] == [
-            pytest.approx(1000 * k, abs=1) for k in (1, 2, 3, 4)
-        ]
-        motors.move_to(dict.fromkeys(names, 15_000))
-        wait_until(motors, lambda s: made.position_um(4) > 5000)
-        begun_s = time.monotonic()
-        motors.stop()
-        assert time.monotonic() - begun_s < STOP_BOUND_S
-        with made.lock:
-            assert not any(c.moving for c in made.bus.controllers)
-        motors.close()
+    line = VirtualLine(dict.fromkeys(names, "open_loop"))
+    line.bus.faults.reply_delay_s = latency_s
+    line.open_at_zero()
+    line.motors.move_to({name: 1000 * k for k, name in enumerate(names, 1)})
+    longest_s, moving = 0.0, True
+    while moving:
+        begun_s = line.now_s
+        status = line.motors.poll()
+        longest_s = max(longest_s, line.now_s - begun_s)
+        moving = status.moving
+        line.wait(0.005)
+    assert status.reached, status
+    assert longest_s < POLL_BOUND_S
+    for k in (1, 2, 3, 4):
+        assert line.position_um(k) == pytest.approx(1000 * k, abs=1)
+    line.motors.move_to(dict.fromkeys(names, 15_000))
+    line.poll(15)
+    assert line.moving()
+    begun_s = line.now_s
+    line.motors.stop()
+    assert line.now_s - begun_s < STOP_BOUND_S
+    assert not line.moving()

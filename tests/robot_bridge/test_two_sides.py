@@ -19,19 +19,12 @@ from hypothesis.stateful import (
 )
 
 from robot_bridge import framing
-from robot_bridge.link import (
-    Answered,
+from robot_bridge.bridge_end import (
     BridgeEnd,
-    GaveUp,
     HeartbeatReceived,
-    HelloReceived,
     MalformedReceived,
     RequestReceived,
-    ServiceEnd,
-    SessionLost,
     SessionOpened,
-    StatusReceived,
-    StopAcknowledged,
     StopReceived,
 )
 from robot_bridge.messages import (
@@ -42,6 +35,15 @@ from robot_bridge.messages import (
     Heartbeat,
     Hello,
     Status,
+)
+from robot_bridge.service_end import (
+    Answered,
+    GaveUp,
+    HelloReceived,
+    ServiceEnd,
+    SessionLost,
+    StatusReceived,
+    StopAcknowledged,
 )
 
 

@@ -88,6 +88,13 @@ def arm(client: RoomClient) -> None:
     wait_for(client.state, lambda s: s.robot.armed and not s.robot.stopped)
 
 
+def stop_all(client: RoomClient) -> None:
+    """STOP, until the robot is stopped and no procedure runs; then arm again."""
+    client.stop()
+    wait_for(client.state, lambda s: s.robot.stopped and s.procedure is None)
+    arm(client)
+
+
 def calibrated(client: RoomClient) -> RoomState:
     """The state of a room that has been calibrated, if need be now."""
     arm(client)

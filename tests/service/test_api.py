@@ -8,7 +8,7 @@ import time
 import httpx
 import numpy as np
 import pytest
-from attended_room import AttendedRoom, arm, calibrated, wait_for
+from attended_room import AttendedRoom, calibrated, stop_all, wait_for
 from PIL import Image
 
 from case_record.record import CaseRecord
@@ -61,6 +61,19 @@ def test_a_jog_out_of_travel_is_refused_with_axis_and_limits(
         client.jog("zz", 100)
 
 
+def test_motion_that_is_locked_for_the_needle_is_refused_until_it_is_out(
+    client: RoomClient, state: RoomState
+) -> None:
+    client.lock_motion()
+    wait_for(client.state, lambda s: s.robot.insertion_locked)
+    for order in (lambda: client.jog("xt", 100), client.start_calibration, client.start_approach):
+        with pytest.raises(RefusedByServiceError) as refused:
+            order()
+        assert refused.value.code == "insertion_locked"
+    client.needle_out()
+    wait_for(client.state, lambda s: not s.robot.insertion_locked)
+
+
 def test_two_operators_at_once_get_one_procedure(client: RoomClient, state: RoomState) -> None:
     answers: list[object] = []
 
@@ -78,9 +91,7 @@ def test_two_operators_at_once_get_one_procedure(client: RoomClient, state: Room
         thread.join()
     assert sum(isinstance(answer, int) for answer in answers) == 1
     assert any(answer in ("busy", "moving") for answer in answers)
-    client.stop()
-    wait_for(client.state, lambda s: s.procedure is None)
-    arm(client)
+    stop_all(client)
 
 
 def test_pages_lead_from_the_first_event_to_the_last(
@@ -247,10 +258,8 @@ def test_a_plan_of_another_number_is_not_confirmed(client: RoomClient, state: Ro
         client.answer(asked.question_id, "perhaps")
     assert unknown.value.code == "unknown_choice"
     before = client.state().robot.positions_um
-    client.stop()
-    wait_for(client.state, lambda s: s.procedure is None)
+    stop_all(client)
     with pytest.raises(RefusedByServiceError) as closed:
         client.answer(asked.question_id, "confirm", plan_id=asked.plan["plan_id"])
     assert closed.value.code == "stale_question"
     assert client.state().robot.positions_um == before
-    arm(client)
