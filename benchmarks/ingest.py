@@ -183,14 +183,17 @@ def _wait_open(port: int) -> None:
 # Senders: each returns slices a second
 
 
-def _dcmsend(port: int, files: list[Path], env: dict[str, str]) -> subprocess.Popen[bytes]:
-    command = ["dcmsend", "-aec", TITLE, "127.0.0.1", str(port), *map(str, files)]
-    return subprocess.Popen(command, env={**os.environ, **env})
-
-
-def _rate(port: int, batches: list[list[Path]], env: dict[str, str]) -> float:
+def _rate(
+    port: int, batches: list[list[Path]], env: dict[str, str], options: tuple[str, ...] = ()
+) -> float:
+    address = ["-aec", TITLE, "127.0.0.1", str(port)]
     began_s = time.perf_counter()
-    senders = [_dcmsend(port, files, env) for files in batches]
+    senders = [
+        subprocess.Popen(
+            ["dcmsend", *options, *address, *map(str, files)], env={**os.environ, **env}
+        )
+        for files in batches
+    ]
     codes = [sender.wait() for sender in senders]
     took_s = time.perf_counter() - began_s
     if any(codes):
@@ -200,7 +203,9 @@ def _rate(port: int, batches: list[list[Path]], env: dict[str, str]) -> float:
 
 def send(pattern: str, port: int, files: list[Path]) -> float:
     if pattern == "four_senders":
-        return _rate(port, [files[k::4] for k in range(4)], {})
+        # storescp serves one association after the other: the last sender must wait for it
+        patient = ("--acse-timeout", "900")
+        return _rate(port, [files[k::4] for k in range(4)], {}, patient)
     if pattern == "association_a_slice":
         few = files[: max(10, len(files) // 10)]
         began_s = time.perf_counter()

@@ -30,7 +30,7 @@ from service.metrics import RoomMetrics
 from service.problems import Problem, add_problems, problem, responses
 from service.room_link import PumpedClient, RoomLink
 from service.routes_access import access_router
-from service.routes_command import command_router, stop_router
+from service.routes_command import clerk_router, command_router, stop_router
 from service.routes_record import image_router, live_router, record_router
 
 PAGE = Path(__file__).parent / "page"
@@ -77,6 +77,7 @@ def create_app(config: Config, announce: Callable[[], None] = lambda: None) -> F
         record_router(case_dir),
         image_router(case_dir),
         command_router(loop),
+        clerk_router(loop),
         access_router(access, uses_tls=uses_tls),
     ):
         app.include_router(router)

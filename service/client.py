@@ -161,6 +161,10 @@ class RoomClient:
     def needle_out(self) -> None:
         self._order("POST", "/api/v1/needle-out")
 
+    def compare_clocks(self, offset_s: float, uncertainty_s: float) -> None:
+        """The room's clock minus the scanner's, compared just now."""
+        self._order("PUT", "/api/v1/clock", offset_s=offset_s, uncertainty_s=uncertainty_s)
+
     def describe_case(self, label: str, operator: str = "", note: str = "") -> None:
         self._order("PUT", "/api/v1/case", label=label, operator=operator, note=note)
 

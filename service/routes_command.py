@@ -110,6 +110,7 @@ def _stop_body(text: bytes) -> StopBody:
 
 
 def command_router(loop: ControlLoop) -> APIRouter:
+    """Robot and procedure."""
     router = APIRouter()
     orders = Orders(loop)
 
@@ -172,6 +173,14 @@ def command_router(loop: ControlLoop) -> APIRouter:
     def needle_out(body: Ask, caller: Caller, key: Key = None) -> None:
         """The needle is out: unlock motion."""
         orders.carry_out(caller, key, "needle_out", body)
+
+    return router
+
+
+def clerk_router(loop: ControlLoop) -> APIRouter:
+    """What the operator tells the record: clocks, case, slices."""
+    router = APIRouter()
+    orders = Orders(loop)
 
     @router.put("/api/v1/clock", tags=["record"], status_code=204, responses=_REFUSALS)
     def clock(body: ClockBody, caller: Caller, key: Key = None) -> None:

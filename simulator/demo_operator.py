@@ -134,7 +134,7 @@ class Operator:
         last = next((s for s in reversed(self._scans()) if s.get("kind") == "acquisition"), None)
         if last is not None:
             offset_s = last["started_s"] - last["scanner_clock_s"]
-            self._put("/api/v1/clock", offset_s=offset_s, uncertainty_s=_CLOCK_READING_S)
+            self._order(self._client.compare_clocks, offset_s, _CLOCK_READING_S)
 
     def _scans(self) -> list[dict[str, Any]]:
         """What the scanner's console shows of its acquisitions."""

@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 
 OUTLIER_SIGMA = 4.5
 _NEIGHBOUR_SHARE = 0.55  # of that, for the neighbours of a pixel left out
-_MAX_ITERATIONS = 40
+_MAX_ITERATIONS = 120  # a filtered magnitude can hold the fit at a saddle for forty
 _LONGEST_STEP_PX = 0.7  # of centre and radius
 _MAX_ROUNDS = 6
 _SAME_SIGMA = 0.1  # relative change of the noise level that leaves the weights as they are

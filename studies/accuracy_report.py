@@ -16,8 +16,8 @@ are public. Every figure below was measured by
     python -m studies.real_data --data FOLDER --out docs/accuracy.md
 
 All methods get the same pixels, the same start and the same radius. Ours is the maximum-likelihood
-fit of `sr_engine.locate.refine`: disc with or without a wall, the likeliest of a short list of point
-spreads. The others are described in `studies/peers.py`.
+fit of `sr_engine.locate.refine`: disc with or without a wall, through the likeliest of a short list
+of point spreads. The others are described in `studies/peers.py`.
 """
 
 SUMMARY = """## Summary

@@ -1,10 +1,13 @@
 """Commands over a line with every fault and restarts of both sides: no harm, and agreement."""
 
 import json
+import tempfile
 from pathlib import Path
 
 import pytest
 from campaign import Campaign, again_asked_moves_nothing
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 SEEDS = (1, 2, 3)
 SHORT_COMMANDS = 600
@@ -33,6 +36,14 @@ def test_no_fault_of_line_or_process_moves_wrongly_or_twice(tmp_path: Path, seed
     assert campaign.room.restarts > 5
     assert campaign.room.to_bridge.frames_hit > 100
     assert len(campaign.room.stops_delivered) > 5
+
+
+@settings(max_examples=12)
+@given(seed=st.integers(0, 2**32 - 1))
+def test_no_seed_finds_harm(seed: int):
+    """Whatever the seed; hypothesis keeps the one that fails."""
+    with tempfile.TemporaryDirectory() as folder:
+        run(Path(folder), seed, 50)
 
 
 @pytest.mark.parametrize("baud", [115200, 57600])

@@ -327,5 +327,5 @@ class TwoSides(RuleBasedStateMachine):
         self.to_service.clear()
 
 
-TwoSides.TestCase.settings = settings(max_examples=120, stateful_step_count=50, deadline=None)
+TwoSides.TestCase.settings = settings(max_examples=120, stateful_step_count=50)
 TestTwoSides = TwoSides.TestCase

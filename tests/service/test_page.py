@@ -81,8 +81,11 @@ def test_a_whole_case_from_calibration_to_the_needle_out_by_clicking(
     wait_for(client.state, lambda s: s.procedure == "calibration")
     wait_for(client.state, lambda s: s.procedure is None and s.calibrated, 120.0)
     expect(page.locator("#prompt")).to_contain_text("target")
+    before = client.state().target_patient_mm
     pick_target(page, client, 2.5, -3.0)
-    target = wait_for(client.state, lambda s: s.target_patient_mm is not None).target_patient_mm
+    target = wait_for(
+        client.state, lambda s: s.target_patient_mm not in (None, before)
+    ).target_patient_mm
     measured = client.state().measurement
     assert target is not None
     assert measured is not None
