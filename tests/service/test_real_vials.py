@@ -1,4 +1,4 @@
-"""`autospine locate` on every real coronal phantom series: the vials are found, slice after slice."""
+"""`autospine locate` on every real coronal phantom series: the vials are found in the slices."""
 
 import collections
 import csv
