@@ -9,7 +9,7 @@ from pathlib import Path
 import httpx
 import pytest
 from attended_room import AttendedRoom, arm, calibrated, running_room, stop_all, wait_for
-from browser import Complaints, running_browser
+from browser import CHROMIUM, Complaints, running_browser
 from playwright.sync_api import Browser, Page, expect
 
 from service.access import new_token, token_hash
@@ -22,6 +22,8 @@ STOP_LIMIT_S = 0.5
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
+    if not CHROMIUM.exists():
+        pytest.skip(f"needs the system's Chromium ({CHROMIUM})")
     with running_browser() as running:
         yield running
 
