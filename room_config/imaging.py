@@ -1,5 +1,7 @@
 """`[imaging]`: what a usable slice looks like, and the fiducial in it."""
 
+from typing import Literal
+
 from pydantic import Field, model_validator
 
 from room_config.section import Section
@@ -29,6 +31,12 @@ class ImagingConfig(Section):
         default=3.0,
         gt=0,
         description="A fiducial further than this from its predicted position is not believed.",
+    )
+
+    readout_polarity: Literal[-1, 0, 1] = Field(
+        default=0,
+        description="Where oil appears: 1 displaced towards growing pixel indices along the "
+        "readout, -1 towards shrinking ones, 0 not known; needed for targets in tissue.",
     )
 
     @model_validator(mode="after")

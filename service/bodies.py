@@ -26,6 +26,16 @@ class PointBody(Ask):
     patient_mm: PointMm = Field(examples=[[12.0, -40.0, 7.5]])
 
 
+class TargetBody(PointBody):
+    """Where the fiducial is to be."""
+
+    label: str = Field(default="", max_length=80)
+    in_water: bool = Field(
+        default=False,
+        description="A place in tissue: the oil-water shift of the slices is allowed for.",
+    )
+
+
 class AnswerBody(Ask):
     """The answer to the question that the state shows, named by its id."""
 

@@ -13,6 +13,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from case_record.record import CaseRecord
 from dicom_listener.intake import reassign
@@ -32,6 +33,13 @@ from service.procedures import (
     latest_calibration,
 )
 from service.room_link import RoomLink
+from service.targets import (
+    TARGET_SET,
+    TARGET_WITHDRAWN,
+    TargetError,
+    current_target,
+    fiducial_must_appear_at,
+)
 from sr_engine.shiftset import named, paper_random
 
 _SOURCE = "service"
@@ -131,13 +139,26 @@ class Commands:
         )
         return self._begin(CALIBRATION, calibration_arguments(arguments), by)
 
-    def set_target(self, patient_mm: Sequence[float], by: str) -> None:
-        """Set where the fiducial is to be, in patient mm (LPS)."""
+    def set_target(
+        self, patient_mm: Sequence[float], by: str, label: str = "", in_water: bool = False
+    ) -> None:
+        """Set where the fiducial is to be, in patient mm (LPS); in_water: a place in tissue."""
         if len(patient_mm) != 3 or not all(math.isfinite(value) for value in patient_mm):
             raise ConflictError("bad_target", "A target is three finite numbers, patient mm.")
+        self._may_change_target()
+        body = {"patient_mm": [float(value) for value in patient_mm]}
+        self._note(TARGET_SET, by, {**body, "label": label, "in_water": in_water})
+
+    def withdraw_target(self, by: str) -> None:
+        """There is no target any more until another one is set."""
+        self._may_change_target()
+        if current_target(self._record) is None:
+            raise ConflictError("no_target", "There is no target to withdraw.")
+        self._note(TARGET_WITHDRAWN, by, {})
+
+    def _may_change_target(self) -> None:
         if self._record.running_procedure() is not None:
             raise ConflictError("busy", "Abort the running procedure before changing the target.")
-        self._note("target_set", by, {"patient_mm": [float(value) for value in patient_mm]})
 
     def set_entry(self, patient_mm: Sequence[float], by: str) -> None:
         """Set the planned skin point, patient mm (LPS)."""
@@ -164,10 +185,7 @@ class Commands:
         """Begin the approach to the target; returns its procedure id."""
         self._may_start()
         start = self._start_point()
-        target = self._record.last_event("target_set")
-        if target is None:
-            raise ConflictError("no_target", "Set a target first.")
-        row, col = start.plane.from_patient(target.body["patient_mm"]).tolist()
+        row, col = self._wanted_place(start).tolist()
         service = self._config.service
         arguments = ApproachArguments(
             target_mm=(row, col),
@@ -184,6 +202,22 @@ class Commands:
             seed=self._seed(),
         )
         return self._begin(APPROACH, approach_arguments(arguments, start), by)
+
+    def _wanted_place(self, start: Calibration) -> NDArray[np.float64]:
+        """Where the fiducial must appear in the image plane to be at the target."""
+        target = current_target(self._record)
+        if target is None:
+            raise ConflictError("no_target", "Set a target first.")
+        newest = self._record.last_slice("assigned")
+        header = {} if newest is None else newest.header
+        try:
+            return fiducial_must_appear_at(
+                target, start.plane, header, self._config.imaging.readout_polarity
+            )
+        except TargetError as error:
+            raise ConflictError(
+                "target_unusable", f"The target cannot be used: {error}."
+            ) from error
 
     def answer(self, question_id: str, choice: str, by: str, plan_id: str | None = None) -> None:
         """Answer the question that is on the page; void if it is another one by now.

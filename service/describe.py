@@ -33,6 +33,7 @@ from service.state import (
     RoomState,
     SliceState,
 )
+from service.targets import current_target
 from sr_engine.geometry import SliceGeometry
 
 PROCESSES = ("listener", "worker")
@@ -59,9 +60,9 @@ class Describer:
         ended = record.last_ended_procedure()
         last = record.last_slice()
         shown = record.last_slice("assigned") or last
-        target = record.last_event("target_set")
+        target = current_target(record)
         entry = record.last_event("entry_set")
-        target_mm = target.body["patient_mm"] if target else None
+        target_mm = list(target.patient_mm) if target else None
         arrival = ready_arrival(record)
         measurement = record.last_measurement()
         robot = _robot(link, before.robot)
@@ -282,7 +283,7 @@ def _idle_prompt(record: CaseRecord, status: BridgeStatus, ready: bool) -> str:
         return "Arm the robot."
     if record.last_procedure("calibration", "done") is None:
         return "Start the calibration."
-    if record.last_event("target_set") is None:
+    if current_target(record) is None:
         return "Set a target."
     return "Start the approach, or set another target."
 

@@ -445,6 +445,7 @@ def _confirm(
         return
     error, _ = _tip_error(arguments, calibration.estimate)
     plan = {
+        "plan_id": f"{calibration.measurement_id}.guide",
         "measurement_id": calibration.measurement_id,
         "from_um": dict(calibration.estimate.setpoints_um),
         "setpoints_um": dict(setpoints_um),

@@ -19,6 +19,7 @@ from service.bodies import (
     PunctureBody,
     Started,
     StopBody,
+    TargetBody,
 )
 from service.control import ControlLoop
 from service.once import Once
@@ -129,9 +130,14 @@ def command_router(loop: ControlLoop) -> APIRouter:
         return Started(procedure_id=orders.carry_out(caller, key, "start_calibration", body))
 
     @router.put("/api/v1/target", tags=["procedure"], status_code=204, responses=_REFUSALS)
-    def target(body: PointBody, caller: Caller, key: Key = None) -> None:
+    def target(body: TargetBody, caller: Caller, key: Key = None) -> None:
         """Set where the fiducial is to be, patient mm (LPS)."""
         orders.carry_out(caller, key, "set_target", body)
+
+    @router.delete("/api/v1/target", tags=["procedure"], status_code=204, responses=_REFUSALS)
+    def withdraw_target(body: Ask, caller: Caller, key: Key = None) -> None:
+        """Withdraw the target; nothing is approached until another one is set."""
+        orders.carry_out(caller, key, "withdraw_target", body)
 
     @router.put("/api/v1/entry", tags=["procedure"], status_code=204, responses=_REFUSALS)
     def entry(body: PointBody, caller: Caller, key: Key = None) -> None:

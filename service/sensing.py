@@ -65,8 +65,8 @@ def move(step: MoveTo) -> ProcedureSteps[Moved]:
             return moved
         if moved.state == "REFUSED":
             break
-        # on its way it left the place where it was planned; its setpoints are still right
-        step = replace(step, from_um=None)
+        # on its way it left the place where it was planned and measured; its setpoints are absolute
+        step = replace(step, from_um=None, rests_on=None)
     raise ProcedureFailedError(moved.code, f"the robot did not move: {moved.text}")
 
 

@@ -89,7 +89,7 @@ def test_a_fiducial_that_is_not_in_the_slice_is_said_so():
 
 
 def test_two_equal_round_objects_are_refused_not_guessed():
-    twin = StaticObject(kind="sphere", centre_mm=(35.0, 58.0, 10.0), radius_mm=4.0, signal=1.0)
+    twin = StaticObject(kind="sphere", centre_mm=(-24.7, 58.0, 9.4), radius_mm=4.0, signal=1.0)
     room = OfflineRoom(MrImaging(VirtualRoom(background=(twin,))), StageParameters(), 0)
     with pytest.raises(ProcedureFailedError, match="two round objects are equally good"):
         room.run(calibrate(calibration_arguments()))

@@ -60,8 +60,8 @@ def kill_at_random(demo, case_dir, dice, punctures, reach_s) -> str | None:
     """Run the demo and kill one of its processes; None if it was done before."""
     running = demo("--exit", "--punctures", str(punctures), "--seed", "5", case_dir=case_dir)
     victim = dice.choice([*VICTIMS, DEMO])
-    pid = running.process.pid if victim == DEMO else running.pid_of(VICTIMS[victim])
-    running.pid_of(VICTIMS["scanner"])  # the last one to be started
+    pid = running.process.pid if victim == DEMO else running.pid_of(VICTIMS[victim], 120.0)
+    running.pid_of(VICTIMS["scanner"], 120.0)  # the last one to be started
     deadline_s = time.monotonic() + dice.uniform(0.0, reach_s)
     while time.monotonic() < deadline_s:
         running.look()

@@ -1,0 +1,137 @@
+"""Targets: set, replaced, withdrawn; the oil-water shift against slices that really have it."""
+
+import numpy as np
+import pytest
+from offline_arguments import approach_arguments, calibration_arguments
+from test_guide import GEOMETRY, PLANE, arguments, make_room, true_guide
+
+from case_record.record import CaseRecord
+from service.approach import approach
+from service.calibration import calibrate
+from service.guide import approach_guide, calibrate_guide
+from service.targets import (
+    Target,
+    TargetError,
+    all_targets,
+    current_target,
+    fiducial_must_appear_at,
+    guide_must_appear_at,
+    oil_shift_mm,
+)
+from simulator.config import SliceProtocol, VirtualRoom
+from simulator.scene import true_fiducial_mm
+from simulator.stage_physics import StageParameters
+from studies.offline_room import MrImaging, OfflineRoom, plane_of
+
+HEADER = {
+    "imaging_frequency_mhz": 123.2,
+    "pixel_bandwidth_hz": 260.0,
+    "phase_encoding_direction": "COL",
+}
+
+
+@pytest.fixture
+def record(tmp_path):
+    with CaseRecord(tmp_path, create=True) as record:
+        record.start_case("test", 1)
+        yield record
+
+
+def set_target(record, *patient_mm, **more):
+    body = {"patient_mm": list(patient_mm), **more}
+    record.append_event("target_set", body, source="test", who="operator")
+
+
+def test_the_newest_target_counts_until_it_is_withdrawn(record):
+    assert current_target(record) is None
+    set_target(record, 1.0, 2.0, 3.0, label="first")
+    set_target(record, 4.0, 5.0, 6.0, label="second", in_water=True)
+    found = current_target(record)
+    assert found == Target(found.number, (4.0, 5.0, 6.0), "second", True)
+    record.append_event("target_withdrawn", {}, source="test", who="operator")
+    assert current_target(record) is None
+    set_target(record, 1.0, 2.0, 3.0)
+    assert current_target(record).patient_mm == (1.0, 2.0, 3.0)
+    assert [target.label for target in all_targets(record)] == ["first", "second", ""]
+
+
+@pytest.mark.parametrize("encoding", ["ROW", "COL"])
+@pytest.mark.parametrize("polarity", [1, -1])
+def test_a_target_in_water_is_reached_although_the_fiducial_is_oil(encoding, polarity):
+    """The slices really have the shift (1.6 px); without the correction this misses by as much."""
+    protocol = SliceProtocol(
+        chemical_shift_ppm=3.4, readout_polarity=polarity, phase_encoding=encoding
+    )
+    room_model = VirtualRoom(protocol=protocol)
+    room = OfflineRoom(MrImaging(room_model), StageParameters(), 4)
+    calibration = room.run(calibrate(calibration_arguments()))
+    x, y, z = true_fiducial_mm(room_model, room.stage_mm).tolist()
+    target = Target(1, (x + 3.0, y, z - 2.0), in_water=True)
+    header = {**HEADER, "phase_encoding_direction": encoding}
+    wanted = fiducial_must_appear_at(target, calibration.plane, header, polarity)
+    room.run(approach(approach_arguments(wanted), calibration))
+    miss = true_fiducial_mm(room_model, room.stage_mm) - np.array(target.patient_mm)
+    assert np.linalg.norm(miss[[0, 2]]) < 0.06
+    uncorrected = fiducial_must_appear_at(
+        Target(1, target.patient_mm), calibration.plane, header, polarity
+    )
+    assert np.linalg.norm(wanted - uncorrected) == pytest.approx(3.4 * 123.2 / 260.0)
+
+
+def test_the_shift_grows_with_the_field_and_shrinks_with_the_bandwidth():
+    there = oil_shift_mm(HEADER, (1.0, 2.0), 1)
+    assert there == pytest.approx([0.0, 2.0 * 3.4 * 123.2 / 260.0])
+    half = {**HEADER, "imaging_frequency_mhz": 61.6}
+    assert oil_shift_mm(half, (1.0, 2.0), 1) == pytest.approx(there / 2)
+    assert oil_shift_mm(HEADER, (1.0, 2.0), -1) == pytest.approx(-there)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"imaging_frequency_mhz": None}, "ImagingFrequency"),
+        ({"pixel_bandwidth_hz": 0.0}, "PixelBandwidth"),
+        ({"pixel_bandwidth_hz": float("nan")}, "PixelBandwidth"),
+        ({"phase_encoding_direction": ""}, "InPlanePhaseEncodingDirection"),
+    ],
+)
+def test_a_header_that_does_not_tell_the_shift_is_refused_by_attribute(change, said):
+    with pytest.raises(TargetError, match=said):
+        oil_shift_mm({**HEADER, **change}, (1.0, 1.0), 1)
+
+
+def test_an_unknown_polarity_is_refused():
+    with pytest.raises(TargetError, match="readout_polarity"):
+        oil_shift_mm(HEADER, (1.0, 1.0), 0)
+
+
+def test_a_fiducial_target_needs_no_header():
+    place = fiducial_must_appear_at(Target(1, (5.0, 58.0, -18.0)), PLANE, {}, 0)
+    assert place == pytest.approx(PLANE.from_patient((5.0, 58.0, -18.0)))
+
+
+def test_entry_and_target_are_met_by_the_needles_line():
+    room = make_room(7)
+    calibration = room.run(calibrate_guide(arguments()))
+    joint_y = float(true_guide(room).point_mm[1])
+    entry, target = (6.0, joint_y - 20.0, -19.0), (9.0, joint_y - 80.0, -22.0)
+    state = guide_must_appear_at(entry, target, GEOMETRY, PLANE, joint_y)
+    room.run(approach_guide(arguments(target_mm=tuple(state.tolist())), calibration))
+    line = true_guide(room)
+    assert line.distance_to_mm(target) < 0.25
+    assert line.distance_to_mm(entry) < 0.15
+
+
+@pytest.mark.parametrize(
+    ("entry", "said"),
+    [((9.0, -20.0, -22.0), "make no line"), ((40.0, -20.5, -22.0), "flatter than 30°")],
+)
+def test_an_entry_that_makes_no_needle_is_refused(entry, said):
+    with pytest.raises(TargetError, match=said):
+        guide_must_appear_at(entry, (9.0, -20.0, -22.0), GEOMETRY, PLANE, -2.0)
+
+
+def test_the_plane_of_the_room_is_coronal():
+    from simulator.mr_slice import slice_geometry
+
+    assert plane_of(slice_geometry(VirtualRoom().protocol)) == PLANE
