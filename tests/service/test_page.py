@@ -146,6 +146,23 @@ def test_the_overlay_shows_the_fiducial_where_it_was_measured(
 SIDES = ("top", "bottom", "left", "right")
 
 
+def test_a_target_in_tissue_is_marked_as_such_and_can_be_withdrawn(
+    page: Page, client: RoomClient
+) -> None:
+    calibrated(client)
+    page.get_by_role("button", name="Pick target").click()
+    page.locator("#in-tissue").check()
+    button(page, "Set target")
+    events = wait_for(
+        lambda: [e for e in client.events() if e.kind == "target_set"],
+        lambda found: found and found[-1].body.get("in_water"),
+    )
+    assert events[-1].who == "operator"
+    page.get_by_role("button", name="Pick target").click()
+    button(page, "Withdraw the target")
+    wait_for(client.state, lambda s: s.target_patient_mm is None)
+
+
 @pytest.mark.parametrize("how", ["mouse", "key"])
 def test_stop_during_motion_stands_still_within_half_a_second_of_the_click(
     page: Page, client: RoomClient, room: AttendedRoom, how: str
