@@ -19,7 +19,6 @@ from dicom_listener.header import Slice
 from dicom_listener.read import Frame, read_frames
 from dicom_listener.reasons import UnusableError
 from service.files import BadFileError, files_of, geometry_of, read_shift_table
-from service.overlay import write_overlay
 from sr_engine.detect import detect
 from sr_engine.errors import EngineError, NoRoundObjectError
 from sr_engine.localize import Localization, localize
@@ -55,6 +54,8 @@ def locate(
     for problem in problems:
         console.print(f"autospine: {problem}", style="yellow", highlight=False, soft_wrap=True)
     if png is not None and shown:
+        from service.overlay import write_overlay  # plotting is slow to import
+
         write_overlay(png, [(frame, [f["_found"] for f in rows]) for frame, rows in shown])
     rows = [{k: v for k, v in row.items() if k != "_found"} for row in found]
     if json_:
