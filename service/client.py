@@ -132,8 +132,15 @@ class RoomClient:
     def start_calibration(self) -> int:
         return self._start("/api/v1/calibration")
 
-    def set_target(self, patient_mm: Sequence[float]) -> None:
-        self._order("PUT", "/api/v1/target", patient_mm=list(patient_mm))
+    def set_target(
+        self, patient_mm: Sequence[float], *, label: str = "", in_water: bool = False
+    ) -> None:
+        """Where the fiducial is to be, LPS mm; in_water: a place in tissue."""
+        fields = {"patient_mm": list(patient_mm), "label": label, "in_water": in_water}
+        self._order("PUT", "/api/v1/target", **fields)
+
+    def withdraw_target(self) -> None:
+        self._order("DELETE", "/api/v1/target")
 
     def set_entry(self, patient_mm: Sequence[float]) -> None:
         self._order("PUT", "/api/v1/entry", patient_mm=list(patient_mm))

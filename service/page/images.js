@@ -248,16 +248,23 @@ export class Images {
       type: "number", step: 0.01, value: pointMm[k].toFixed(2), "aria-label": `${name}, patient mm`,
       onchange: (event) => { this.picked = this.picked.map((value, j) => (j === k && Number.isFinite(event.target.valueAsNumber) ? event.target.valueAsNumber : value)); this.overlays(); },
     }));
+    this.inTissue ??= h("input", { type: "checkbox", id: "in-tissue" });
+    const withdraw = this.state.target_patient_mm ? h("button", {
+      type: "button", onclick: () => act(async () => { await order("DELETE", "/api/v1/target"); this.endPick(); }),
+    }, "Withdraw the target") : null;
     replace(this.pickBar, h("span", {}, "Target, patient mm (LPS); arrow keys move it by 0.1 mm: "),
       number(0, "x"), number(1, "y"), number(2, "z"),
+      h("label", { title: "The oil of the fiducial and the water of tissue do not appear at the same place: allow for it." }, this.inTissue, " lies in tissue"),
       h("button", { type: "button", id: "set-target", onclick: () => act(() => this.setTarget("target")) }, "Set target"),
       h("button", { type: "button", id: "set-entry", onclick: () => act(() => this.setTarget("entry")) }, "Set entry point"),
+      withdraw,
       h("button", { type: "button", onclick: () => this.endPick() }, "Leave"));
     this.overlays();
   }
 
   async setTarget(what) {
-    await order("PUT", `/api/v1/${what}`, { patient_mm: this.picked });
+    const more = what === "target" ? { in_water: this.inTissue.checked } : {};
+    await order("PUT", `/api/v1/${what}`, { patient_mm: this.picked, ...more });
     this.endPick();
   }
 

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 from playwright.sync_api import Browser, Page, sync_playwright
 
-_CHROMIUM = "/usr/bin/chromium"
+CHROMIUM = Path("/usr/bin/chromium")
 _OPTIONS = [
     "--no-sandbox",
     "--disable-gpu",
@@ -22,7 +23,7 @@ _OPTIONS = [
 @contextmanager
 def running_browser() -> Iterator[Browser]:
     with sync_playwright() as playwright:
-        browser = playwright.chromium.launch(executable_path=_CHROMIUM, args=_OPTIONS)
+        browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=_OPTIONS)
         try:
             yield browser
         finally:

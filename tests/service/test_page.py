@@ -9,7 +9,7 @@ from pathlib import Path
 import httpx
 import pytest
 from attended_room import AttendedRoom, arm, calibrated, running_room, stop_all, wait_for
-from browser import Complaints, running_browser
+from browser import CHROMIUM, Complaints, running_browser
 from playwright.sync_api import Browser, Page, expect
 
 from service.access import new_token, token_hash
@@ -22,6 +22,8 @@ STOP_LIMIT_S = 0.5
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
+    if not CHROMIUM.exists():
+        pytest.skip(f"needs the system's Chromium ({CHROMIUM})")
     with running_browser() as running:
         yield running
 
@@ -142,6 +144,23 @@ def test_the_overlay_shows_the_fiducial_where_it_was_measured(
 
 
 SIDES = ("top", "bottom", "left", "right")
+
+
+def test_a_target_in_tissue_is_marked_as_such_and_can_be_withdrawn(
+    page: Page, client: RoomClient
+) -> None:
+    calibrated(client)
+    page.get_by_role("button", name="Pick target").click()
+    page.locator("#in-tissue").check()
+    button(page, "Set target")
+    events = wait_for(
+        lambda: [e for e in client.events() if e.kind == "target_set"],
+        lambda found: found and found[-1].body.get("in_water"),
+    )
+    assert events[-1].who == "operator"
+    page.get_by_role("button", name="Pick target").click()
+    button(page, "Withdraw the target")
+    wait_for(client.state, lambda s: s.target_patient_mm is None)
 
 
 @pytest.mark.parametrize("how", ["mouse", "key"])
