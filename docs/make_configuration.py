@@ -44,6 +44,7 @@ the table by itself. Travel limits have no default on purpose.
 | `park_after_move` | false | Park the drives after every move (a powered drive costs SNR). |
 | `guardian` | true | A second process that stops the motors if the daemon is killed. |
 | `capture_file` | none | Every byte to and from the controllers. |
+| `service_link` | none | The service's end of the line, for `autospine robot`; else `[service] bridge_link`. |
 | axis `name` | required | `xt`, `yt` (top stage), `xb`, `yb` (bottom stage). |
 | axis `controller`, `address` | required | Serial device and PMD401/PMD301 address. |
 | axis `drive` | required | `open_loop` (steps) or `closed_loop` (encoder). |

@@ -120,8 +120,8 @@ export class Next {
   }
 }
 
-function promptOf({ prompt, question }) {
-  if (!question?.plan) return prompt;
+function promptOf({ prompt, question, robot }) {
+  if (!question?.plan || !robot.linked) return prompt;
   return `Confirm the move of ${mm(Math.hypot(...question.plan.displacement_mm), 3)} mm?`;
 }
 

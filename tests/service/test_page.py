@@ -189,6 +189,7 @@ def test_a_confirmation_that_comes_second_is_refused_and_says_why(
     page: Page, browser: Browser, room: AttendedRoom, client: RoomClient
 ) -> None:
     ask_for_a_move(client)
+    asked_at = client.state().event_id
     second = browser.new_page()
     second.goto(room.url)
     for screen in (page, second):
@@ -200,8 +201,7 @@ def test_a_confirmation_that_comes_second_is_refused_and_says_why(
     second.evaluate("window.hang.click()")
     expect(second.locator("#refusal")).to_contain_text("not open any more")
     second.close()
-    state = client.state()
-    assert sum(event.kind == "answered" for event in client.events(after=state.event_id - 40)) == 1
+    assert sum(event.kind == "answered" for event in client.events(after=asked_at)) == 1
     stop_all(client)
 
 
