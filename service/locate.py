@@ -10,6 +10,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.progress import track
 from rich.table import Table
@@ -20,8 +21,9 @@ from dicom_listener.reasons import UnusableError
 from service.files import BadFileError, files_of, geometry_of, read_shift_table
 from service.overlay import write_overlay
 from sr_engine.detect import detect
-from sr_engine.errors import EngineError
+from sr_engine.errors import EngineError, NoRoundObjectError
 from sr_engine.localize import Localization, localize
+from sr_engine.locate import Located, locate_all
 
 COULD_NOT = 3
 METHODS = ("ml", "sr", "bicubic", "base")
@@ -112,19 +114,32 @@ def _round_objects(
     spacing = float(np.mean(geometry_of(header, file).spacing_mm))
     radii_px = (radii_mm[0] / spacing, radii_mm[1] / spacing)
     bounds = None if roi is None else (roi[0], roi[1], roi[2], roi[3])
-    rows: Rows = []
-    for candidate in detect(pixels, radii_px, roi=bounds):
-        try:
-            one = localize(
-                pixels,
-                start_px=candidate.centre_px,
-                radius_px=(candidate.radius_px * 0.8, candidate.radius_px * 1.25),
-                method=method,
-            )
-        except EngineError:
-            continue  # a candidate that the model does not explain is no round object
-        rows.append(_row(one, header, [file]))
+    found: list[Located] | list[Localization]
+    if method == "ml":
+        found = locate_all(pixels, radii_px, roi=bounds)
+    else:
+        found = _by_the_papers_method(pixels, radii_px, bounds, method)
+    rows = [_row(one, header, [file]) for one in found]
     return sorted(rows, key=lambda row: (round(row["row"]), row["col"]))
+
+
+def _by_the_papers_method(
+    pixels: NDArray[np.float64],
+    radii_px: tuple[float, float],
+    roi: tuple[int, int, int, int] | None,
+    method: str,
+) -> list[Localization]:
+    """What the paper's circle finder says of each round object that is seen."""
+    found: list[Localization] = []
+    for candidate in detect(pixels, radii_px, roi=roi):
+        near = (candidate.radius_px * 0.8, candidate.radius_px * 1.25)
+        try:
+            found.append(
+                localize(pixels, start_px=candidate.centre_px, radius_px=near, method=method)
+            )
+        except NoRoundObjectError:
+            continue  # the circle finder does not see it; the others are told
+    return found
 
 
 def _locate_together(
@@ -161,7 +176,7 @@ def _locate_together(
     return [row], [(frames[0], [row])], []
 
 
-def _row(one: Localization, header: Slice, files: Sequence[Path]) -> dict[str, Any]:
+def _row(one: Localization | Located, header: Slice, files: Sequence[Path]) -> dict[str, Any]:
     sigma = np.sqrt(np.diag(one.covariance_px2))
     patient_mm = geometry_of(header, files[0]).patient_from_pixel(one.centre_px)
     return {

@@ -11,6 +11,7 @@ import numpy as np
 
 from dicom_listener.read import Frame
 from sr_engine.localize import Localization
+from sr_engine.locate import Located
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -20,7 +21,9 @@ _MOST_PANELS = 16
 _PANEL_INCHES = 4.5
 
 
-def write_overlay(path: Path, shown: Sequence[tuple[Frame, Sequence[Localization]]]) -> None:
+def write_overlay(
+    path: Path, shown: Sequence[tuple[Frame, Sequence[Localization | Located]]]
+) -> None:
     """Write a PNG with a panel a slice (at most 16), each object with its centre and radius."""
     panels = shown[:_MOST_PANELS]
     columns = math.ceil(math.sqrt(len(panels)))

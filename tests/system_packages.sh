@@ -8,6 +8,7 @@ need storescu dcmtk
 need Orthanc orthanc
 need chromium chromium
 need docker-compose docker-compose
+need dciodvfy dicom3tools
 [ -n "$wanted" ] || exit 0
 if [ "$(id -u)" != 0 ] || ! command -v apt-get >/dev/null 2>&1; then
     echo "not installed (needs root and apt):$wanted; the tests that use them will be skipped" >&2
