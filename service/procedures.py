@@ -10,11 +10,21 @@ from case_record.record import CaseRecord
 from case_record.rows import Procedure
 from service.approach import ApproachArguments, Arrival, approach
 from service.calibration import Calibration, CalibrationArguments, calibrate
+from service.guide import (
+    GuideArguments,
+    GuideArrival,
+    GuideCalibration,
+    GuideGeometry,
+    approach_guide,
+    calibrate_guide,
+)
 from service.jog import JogEnd, jog
 from service.steps import ProcedureSteps
 
 CALIBRATION = "calibration"
 APPROACH = "approach"
+GUIDE_CALIBRATION = "guide_calibration"
+GUIDE_APPROACH = "guide_approach"
 JOG = "jog"
 
 
@@ -31,7 +41,17 @@ def approach_arguments(arguments: ApproachArguments, start: Calibration) -> dict
     return {"arguments": asdict(arguments), "start": start.to_json()}
 
 
-def result_to_json(result: Calibration | Arrival | JogEnd) -> dict[str, Any]:
+def guide_calibration_arguments(arguments: GuideArguments) -> dict[str, Any]:
+    return asdict(arguments)
+
+
+def guide_approach_arguments(arguments: GuideArguments, start: GuideCalibration) -> dict[str, Any]:
+    return {"arguments": asdict(arguments), "start": start.to_json()}
+
+
+def result_to_json(
+    result: Calibration | Arrival | GuideCalibration | GuideArrival | JogEnd,
+) -> dict[str, Any]:
     return result.to_json()
 
 
@@ -63,8 +83,31 @@ def _build_approach(value: Mapping[str, Any]) -> ProcedureSteps[Arrival]:
     return approach(arguments, Calibration.from_json(value["start"]))
 
 
+def _guide_arguments(value: Mapping[str, Any]) -> GuideArguments:
+    xt, yt, xb, yb = value["axes"]
+    upper_mm, lower_mm = value["geometry"]["slice_positions_mm"]
+    geometry = {**value["geometry"], "slice_positions_mm": (upper_mm, lower_mm)}
+    target_mm = value["target_mm"]
+    return GuideArguments(
+        **{
+            **value,
+            "axes": (xt, yt, xb, yb),
+            "geometry": GuideGeometry(**geometry),
+            "travel_um": {axis: (low, high) for axis, (low, high) in value["travel_um"].items()},
+            "target_mm": None if target_mm is None else tuple(target_mm),
+        }
+    )
+
+
+def _build_guide_approach(value: Mapping[str, Any]) -> ProcedureSteps[GuideArrival]:
+    start = GuideCalibration.from_json(value["start"])
+    return approach_guide(_guide_arguments(value["arguments"]), start)
+
+
 _BUILDERS: dict[str, Callable[[Mapping[str, Any]], ProcedureSteps[Any]]] = {
     CALIBRATION: _build_calibration,
     APPROACH: _build_approach,
+    GUIDE_CALIBRATION: lambda value: calibrate_guide(_guide_arguments(value)),
+    GUIDE_APPROACH: _build_guide_approach,
     JOG: lambda value: jog(value["setpoints_um"]),
 }

@@ -134,7 +134,9 @@ def command_router(loop: ControlLoop) -> APIRouter:
         """Set where the fiducial is to be, patient mm (LPS)."""
         orders.carry_out(caller, key, "set_target", body)
 
-    @router.delete("/api/v1/target", tags=["procedure"], status_code=204, responses=_REFUSALS)
+    @router.post(
+        "/api/v1/target/withdraw", tags=["procedure"], status_code=204, responses=_REFUSALS
+    )
     def withdraw_target(body: Ask, caller: Caller, key: Key = None) -> None:
         """Withdraw the target; nothing is approached until another one is set."""
         orders.carry_out(caller, key, "withdraw_target", body)

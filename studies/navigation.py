@@ -32,6 +32,7 @@ CALIBRATION_MOVE_UM = 15_000
 RANDOM_POINT_MM = 7.5
 IMAGE_MINUTES: dict[str, float] = {"benchtop": 0.46, "mri": 2.62}
 GROUP = 14
+REGION_PX = (24.0, 24.0, 104.0, 104.0)
 SNR = 10.0
 STEP_SCATTER = 0.002
 TOLERANCE_MM = 0.06
@@ -51,7 +52,10 @@ ASSUMPTIONS: dict[str, str] = {
         "three points, 15 mm moves, and the way back, seen in base images, scaled for the other "
         "images and not refined later; adaptive sees them its own way and learns from every move"
     ),
-    "circle finding": "sensitivity 0.85, radius 2.5 to 6.5 px; the fiducial's radius is 4 mm",
+    "circle finding": (
+        "sensitivity 0.85, radius 2.5 to 6.5 px; the fiducial's radius is 4 mm; at first it is "
+        "looked for in the middle 80 px of the image, later within 3 px of its predicted place"
+    ),
     "noise": (
         "SNR 10, contrast over noise of one pixel (of the camera: before scaling): there the "
         "circle in a base image errs by 0.14 px, nearest to the paper's numerical 0.156 px"
@@ -133,7 +137,11 @@ def run_group(group: Group) -> GroupResult:
             arrival = room.run(approach(arguments, there))
         except ProcedureFailedError as error:
             failures.append(str(error))
-            calibration = room.run(calibrate(_calibration_arguments(group)))
+            try:
+                calibration = room.run(calibrate(_calibration_arguments(group)))
+            except ProcedureFailedError as again:
+                failures.append(str(again))
+                break
             continue
         calibration = arrival.calibration
         done.append(_puncture(room, arrival, first_mm, group.setup, room.frames - before))
@@ -188,7 +196,8 @@ def _room(group: Group) -> OfflineRoom:
     if group.setup == "benchtop":
         camera = Camera(noise=Camera().contrast / group.snr)
         imaging = CameraImaging(room, camera, frame_s=seconds)
-    return OfflineRoom(imaging, StageParameters(scatter=group.step_scatter), group.seed)
+    stages = StageParameters(scatter=group.step_scatter)
+    return OfflineRoom(imaging, stages, group.seed, region_px=REGION_PX)
 
 
 def _calibration_arguments(group: Group) -> CalibrationArguments:

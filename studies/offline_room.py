@@ -138,6 +138,7 @@ def _true_plane_mm(room: VirtualRoom, stage_mm: Mapping[str, float]) -> Array:
 class OfflineRoom:
     """Motors without encoders, as in the default room: a readback is the count of the steps sent.
 
+    region_px: (r0, c0, r1, c1), where the fiducial is looked for while its place is not known;
     answer: what the operator says to a question; confirms by default, and never rescans.
     """
 
@@ -149,6 +150,7 @@ class OfflineRoom:
         *,
         axes: tuple[str, ...] = ("xt", "yt"),
         radius_mm: tuple[float, float] = (2.5, 6.5),
+        region_px: tuple[float, float, float, float] | None = None,
         answer: Callable[[AskOperator], str] | None = None,
     ) -> None:
         self.imaging = imaging
@@ -165,6 +167,7 @@ class OfflineRoom:
         self.scan_s = 0.0
         self._rng = np.random.default_rng(seed)
         self._radius_mm = radius_mm
+        self._region_px = region_px
         self._answer = answer or _agree
         self._slices: dict[int, list[SeenSlice]] = {1: []}
         self._measurements = 0
@@ -267,7 +270,7 @@ class OfflineRoom:
             tuple(one.row for one, _ in taken),
         )
         try:
-            request = measure_request(step, self._radius_mm)
+            request = measure_request(step, self._radius_mm, self._region_px)
             found = localize_request(frames, step.method, request, self.imaging.psf)
         except EngineError as error:
             return Measured(self._measurements, error.reason, str(error))

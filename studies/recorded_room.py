@@ -167,7 +167,7 @@ class RecordedRoom(OfflineRoom):
         )
 
     def _measure(self, step: Measure) -> Measured:
-        request = measure_request(step, self._radius_mm)
+        request = measure_request(step, self._radius_mm, self._region_px)
         hold_ids = [hold.hold_id for hold in step.holds]
         number = self.record.request_measurement(step.method, hold_ids, request)
         measure(self.record, self.record.measurement(number), factor=2)

@@ -1,11 +1,15 @@
 """Calibration in the offline room: what it finds is true, what it says of its errors too."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from offline_arguments import calibration_arguments
 
 from service.calibration import calibrate
-from service.sensing import ProcedureFailedError
+from service.estimate import MotionNoise
+from service.looking import STRATEGIES, LookArguments, look_at_fiducial
+from service.sensing import ProcedureFailedError, move
 from service.steps import MoveTo
 from simulator.config import Fiducial, StaticObject, VirtualRoom
 from simulator.stage_physics import StageParameters
@@ -93,3 +97,30 @@ def test_two_equal_round_objects_are_refused_not_guessed():
     room = OfflineRoom(MrImaging(VirtualRoom(background=(twin,))), StageParameters(), 0)
     with pytest.raises(ProcedureFailedError, match="two round objects are equally good"):
         room.run(calibrate(calibration_arguments()))
+
+
+def test_the_native_jacobian_scaled_is_the_one_of_super_resolution_images(calibrated):
+    """As the paper says: repeating the procedure with SR images (0.5 mm pixels) gives the same."""
+    room, calibration = calibrated
+    looking = LookArguments(3.0, 5.0, MotionNoise(0.014, 0.015), seed=1)
+
+    def seen_with_sr(setpoints_um, number):
+        moved = yield from move(MoveTo(setpoints_um, "calibration"))
+        estimate = calibration.estimate.moved_to(
+            moved.readback_um, calibration.jacobian, looking.noise
+        )
+        look = yield from look_at_fiducial(
+            STRATEGIES["sr"].fine,
+            replace(calibration, estimate=estimate),
+            looking,
+            number=number,
+            fresh=True,
+        )
+        return look.found.plane_mm / 0.5  # in pixels of the SR image
+
+    places = [ORIGIN, {"xt": 15_000, "yt": 0}, {"xt": 15_000, "yt": 15_000}]
+    first, second, third = (room.run(seen_with_sr(p, n)) for n, p in enumerate(places))
+    sr_px_per_mm = np.stack([second - first, third - second], axis=1) / 15.0
+    native_px_per_mm = calibration.jacobian.columns[:, (0, 2)] / 1.0
+    # a circle in an SR image errs by about 0.2 of its pixels, a move by 1 %
+    assert sr_px_per_mm == pytest.approx(2 * native_px_per_mm, abs=0.06)

@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from case_record.record import CaseRecord
 from service.guide import (
     REJECT,
     GuideArguments,
@@ -17,12 +18,20 @@ from service.guide import (
     tip_of,
 )
 from service.kinematics import Line
+from service.procedures import (
+    GUIDE_APPROACH,
+    GUIDE_CALIBRATION,
+    guide_approach_arguments,
+    guide_calibration_arguments,
+)
+from service.replay import replay_measurements, replay_procedure
 from service.sensing import ProcedureFailedError
 from simulator.config import Fiducial, VirtualRoom
 from simulator.mr_slice import slice_geometry
 from simulator.scene import true_fiducials_mm
 from simulator.stage_physics import StageParameters
 from studies.offline_room import MrImaging, OfflineRoom, plane_of
+from studies.recorded_room import RecordedRoom
 
 AXES = ("xt", "yt", "xb", "yb")
 UPPER, LOWER, APART, BELOW = 48.0, 14.0, 60.0, 80.0
@@ -225,3 +234,27 @@ def test_a_calibration_survives_its_json_form(recorded):
 def test_fiducials_in_an_order_that_cannot_be_are_refused(upper, lower):
     with pytest.raises(ValueError, match="above the lower one"):
         GuideGeometry(upper, lower, APART, (1.0, 2.0))
+
+
+def test_a_recorded_case_of_four_axes_replays_to_the_last_bit(tmp_path):
+    """Real DICOM files of two slice positions, the real worker, and the case's record."""
+    with CaseRecord(tmp_path, create=True) as record:
+        room = RecordedRoom(record, MrImaging(ROOM), StageParameters(), 3, axes=AXES)
+        calibration = room.run_recorded(GUIDE_CALIBRATION, guide_calibration_arguments(arguments()))
+        target = calibration.estimate.plane_mm + np.array([1.0, -1.5, 0.5, 1.0])
+        approached = guide_approach_arguments(
+            arguments(target_mm=tuple(target.tolist())), calibration
+        )
+        arrival = room.run_recorded(GUIDE_APPROACH, approached)
+        wanted = GEOMETRY.tip_from_fiducials @ target
+        assert np.linalg.norm(true_tip(room) - wanted) < 0.25
+        assert arrival.probability >= 0.95
+        assert all(replay_procedure(record, row).agrees for row in record.procedures())
+        again = list(replay_measurements(record, None))
+    assert len(again) == 2 * 6 + arrival_measurements(arrival)
+    assert all(row.difference_mm == 0.0 for row in again)
+
+
+def arrival_measurements(arrival):
+    """Two a look; looking longer measures both fiducials again."""
+    return arrival.calibration.measurement_id - 2 * 6
