@@ -151,7 +151,11 @@ class DemoRoom:
         line = self.virtual_dir / "line-service"
         tables = {
             "room": {"name": "virtual room", "case_dir": str(self.folder), "virtual": True},
-            "imaging": {"distortion_corrected": False},
+            "imaging": {
+                "distortion_corrected": False,
+                # the tubes at the edge of the field are round, too
+                "start_region_px": [30, 30, 98, 98],
+            },
             "listener": {
                 "port": dicom_port,
                 # as if the clocks had been compared at the console, to a fiftieth of a second
