@@ -42,8 +42,8 @@ slow drift is left out; of several objects the median.
 *As taken*: the slices as they are. The phantom stays on the same pixel phase, so a method that
 answers in whole or half pixels (OpenCV, scikit-image) repeats to 0 while it is wrong by up to half
 a pixel; those are left out of "best other" here, and by their bare figures would win. *Displaced*:
-every slice moved by a known random part of a pixel first, by a phase on its k-space, and the answer less that: what the robot does
-with the fiducial. Here all count.
+every slice moved by a known random part of a pixel first, by a phase on its k-space, and the answer
+less that: what the robot does with the fiducial. Here all count.
 
 | group | kind | slices | objects | ours, as taken | best other | ours, displaced | best other |
 |---|---|---:|---:|---:|---|---:|---|"""
