@@ -250,7 +250,7 @@ export class Images {
     }));
     this.inTissue ??= h("input", { type: "checkbox", id: "in-tissue" });
     const withdraw = this.state.target_patient_mm ? h("button", {
-      type: "button", onclick: () => act(async () => { await order("DELETE", "/api/v1/target"); this.endPick(); }),
+      type: "button", onclick: () => act(async () => { await order("POST", "/api/v1/target/withdraw"); this.endPick(); }),
     }, "Withdraw the target") : null;
     replace(this.pickBar, h("span", {}, "Target, patient mm (LPS); arrow keys move it by 0.1 mm: "),
       number(0, "x"), number(1, "y"), number(2, "z"),

@@ -17,8 +17,6 @@ from service.state import RoomState
 from simulator.demo_room import DemoOptions, DemoRoom
 from simulator.truth_client import TruthAddress, ask_path
 
-# where the fiducial is looked for at first: not at the tubes beside the robot
-_REGION = "start_region_px = [30.0, 30.0, 98.0, 98.0]\n"
 Seen = TypeVar("Seen")
 
 
@@ -32,7 +30,6 @@ class AttendedRoom(DemoRoom):
     def _write_config(self, ports: tuple[int, int]) -> Path:
         path = super()._write_config(ports)
         text = path.read_text().replace("confirm_moves = false", "confirm_moves = true")
-        text = text.replace("[imaging]\n", f"[imaging]\n{_REGION}", 1)
         path.write_text(text + self._more)
         return path
 

@@ -29,7 +29,7 @@ class Ended:
 def children_of(pid: int) -> dict[int, str]:
     """Process id -> command line of everything below `pid`."""
     listed = subprocess.run(
-        ["ps", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True
+        ["ps", "-ww", "-eo", "pid=,ppid=,args="], capture_output=True, text=True, check=True
     ).stdout
     rows = [line.split(None, 2) for line in listed.splitlines()]
     below: dict[int, str] = {}
