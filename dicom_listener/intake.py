@@ -146,6 +146,8 @@ class Intake:
         if any(row.sha256 == envelope.sha256 for row in before):
             self._drop_duplicate(path, envelope)
             return
+        # a sync or reset that was recorded before this slice came must count for it
+        self._read_events(replaying=False)
         try:
             rows, slices = self._rows_of(path, name, envelope, conflict=bool(before))
         except sqlite3.Error:
