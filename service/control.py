@@ -10,7 +10,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
@@ -183,8 +183,7 @@ class ControlLoop:
                 asked = self._queue.get_nowait()
             except queue.Empty:
                 return
-            _answer(self._commands, asked, moving)
-            self._publish()
+            _answer(self._commands, asked, moving, self._publish)
 
     def _publish_if_due(self) -> bool:
         """Publish when something was recorded, and every now and then; whether it was done."""
@@ -207,14 +206,19 @@ class _Closing(Exception):
     """The loop is asked to end; what runs stays as it is recorded."""
 
 
-def _answer(commands: Commands, asked: _Asked, moving: bool) -> None:
+def _answer(
+    commands: Commands, asked: _Asked, moving: bool, publish: Callable[[], None]
+) -> None:
+    """Carry out what was asked; the state that shows it is published before the answer is given."""
     if not asked.future.set_running_or_notify_cancel():
         return  # whoever asked has given up waiting: not carried out
     try:
         if moving and asked.name not in _WHILE_MOVING:
             raise ConflictError("moving", "The robot moves: wait until it stands, or press STOP.")
-        asked.future.set_result(getattr(commands, asked.name)(**asked.arguments))
+        result = getattr(commands, asked.name)(**asked.arguments)
         log.info("command", command=asked.name, by=asked.arguments.get("by"))
+        publish()
+        asked.future.set_result(result)
     except (ConflictError, CaseRecordError) as error:
         log.info("refused", command=asked.name, by=asked.arguments.get("by"), why=str(error))
         asked.future.set_exception(error)

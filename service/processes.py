@@ -96,6 +96,8 @@ def bind(room: Config) -> socket.socket:
         structlog.get_logger().warning("tokens travel unencrypted: set service.tls_certificate")
     try:
         listening.bind((host, port))
+        # now, not when uvicorn comes to it: who reads the ready line may connect at once
+        listening.listen()
     except OSError as error:
         listening.close()
         raise ConfigError(f"service port {host}:{port}: {error.strerror}") from None
