@@ -371,10 +371,13 @@ def test_a_sender_with_nagles_algorithm_is_not_held_up(tmp_path):
     """40 ms a message is what a delayed acknowledgement would cost."""
     with serving(tmp_path) as server, associated(server.port) as association:
         association.dul.socket.socket.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 0)
-        began_s = time.perf_counter()
+        took_s = []
         for k in range(50):
+            began_s = time.perf_counter()
             assert association.send_c_store(mr_data_set(f"1.2.826.0.2.{k + 1}")).Status == 0
-        assert (time.perf_counter() - began_s) / 50 < 0.035
+            took_s.append(time.perf_counter() - began_s)
+        # the quick ones: a busy machine delays some, a delayed acknowledgement all of them
+        assert sorted(took_s)[5] < 0.035
 
 
 def test_where_quickack_does_not_exist_it_is_not_set(monkeypatch):
