@@ -275,6 +275,19 @@ def test_a_port_in_use_ends_with_code_2_and_one_line(tmp_path, config):
         assert len(ended.stderr.strip().splitlines()) == 1
 
 
+def test_a_second_listener_on_the_same_case_ends_with_code_2_and_one_line(config):
+    with listening(config) as listener:
+        ended = run_listener(config)
+        assert ended.returncode == 2
+        assert "another listener" in ended.stderr
+        assert str(listener.process.pid) in ended.stderr
+        assert len(ended.stderr.strip().splitlines()) == 1
+        assert send(listener.port, mr_data_set()) == [0]
+        listener.kill()
+    with listening(config) as listener:
+        assert send(listener.port, mr_data_set("1.2.826.0.5")) == [0]
+
+
 def test_check_tries_everything_once(config):
     ended = run_listener(config, "--check")
     assert ended.returncode == 0, ended.stdout + ended.stderr
