@@ -29,7 +29,7 @@ from pynetdicom.association import Association
 from case_record.record import CaseRecord
 from dicom_listener.header import read_header
 from dicom_listener.inbox import is_whole, read_envelope
-from dicom_listener.intake import reassign, reset_clock
+from dicom_listener.overrule import reassign, reset_clock
 from dicom_listener.pixels import magnitude_pixels
 from dicom_listener.process import run
 from dicom_listener.quirks import MR_IMAGE
