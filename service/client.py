@@ -172,6 +172,14 @@ class RoomClient:
         """The room's clock minus the scanner's, compared just now."""
         self._order("PUT", "/api/v1/clock", offset_s=offset_s, uncertainty_s=uncertainty_s)
 
+    def forget_clock(self, why: str = "") -> None:
+        """The scanner's clock was set: the next slices show it anew."""
+        self._order("POST", "/api/v1/clock/reset", why=why)
+
+    def give_up_slices(self, hold_id: int, why: str = "") -> None:
+        """No more slices will come of this hold."""
+        self._order("POST", f"/api/v1/holds/{hold_id}/give-up", why=why)
+
     def describe_case(self, label: str, operator: str = "", note: str = "") -> None:
         self._order("PUT", "/api/v1/case", label=label, operator=operator, note=note)
 

@@ -41,6 +41,7 @@ _WHILE_MOVING = frozenset(
         "describe_case",
         "assign_slice",
         "confirm_acquisition",
+        "give_up_slices",
         "set_entry",
     }
 )
