@@ -17,7 +17,7 @@ from typing import Any, TypeVar
 import httpx
 from pydantic import BaseModel, TypeAdapter
 
-from service.bodies import EventBody, MeasurementBody, SessionBody, SliceBody, Started
+from service.bodies import EventBody, KnownTarget, MeasurementBody, SessionBody, SliceBody, Started
 from service.state import RoomState
 
 _TIMEOUT_S = 35.0
@@ -129,8 +129,9 @@ class RoomClient:
         """Clear a latched stop, take the positions as they stand, and arm."""
         self._order("POST", "/api/v1/reset")
 
-    def start_calibration(self) -> int:
-        return self._start("/api/v1/calibration")
+    def start_calibration(self, *, guide: bool | None = None) -> int:
+        """guide: with both fiducials and four axes; None: as the room is configured."""
+        return self._start("/api/v1/calibration", guide=guide)
 
     def set_target(
         self, patient_mm: Sequence[float], *, label: str = "", in_water: bool = False
@@ -140,13 +141,25 @@ class RoomClient:
         self._order("PUT", "/api/v1/target", **fields)
 
     def withdraw_target(self) -> None:
-        self._order("DELETE", "/api/v1/target")
+        self._order("POST", "/api/v1/target/withdraw")
+
+    def record_target(self, label: str = "") -> int:
+        """The place where the fiducial is now becomes the target."""
+        return self._start("/api/v1/target/here", label=label)
+
+    def targets(self) -> list[KnownTarget]:
+        """Every target of the case."""
+        return self._list("/api/v1/targets", KnownTarget)
+
+    def choose_target(self, number: int) -> None:
+        self._order("POST", f"/api/v1/targets/{number}/choose")
 
     def set_entry(self, patient_mm: Sequence[float]) -> None:
         self._order("PUT", "/api/v1/entry", patient_mm=list(patient_mm))
 
-    def start_approach(self) -> int:
-        return self._start("/api/v1/approach")
+    def start_approach(self, *, guide: bool | None = None) -> int:
+        """guide: to the line from entry to target; None: as the room is configured."""
+        return self._start("/api/v1/approach", guide=guide)
 
     def jog(self, axis: str, distance_um: int) -> int:
         return self._start("/api/v1/jog", axis=axis, distance_um=distance_um)
