@@ -348,6 +348,21 @@ def test_an_association_that_falls_silent_is_ended(tmp_path):
         wait_for(lambda: server.scp.open_associations == 0)
 
 
+def test_an_association_outlives_that_our_clock_is_set(tmp_path, monkeypatch):
+    with serving(tmp_path) as server:
+        ae = AE("SCANNER")
+        ae.network_timeout = ae.acse_timeout = ae.dimse_timeout = None  # its own timers
+        ae.add_requested_context(MR_IMAGE, [ExplicitVRLittleEndian])
+        association = mended(ae.associate("127.0.0.1", server.port, ae_title="AUTOSPINE"))
+        assert association.send_c_store(mr_data_set("1.2.1")).Status == 0
+        wall_s = time.time
+        for step_s in (3600.0, -3600.0):
+            monkeypatch.setattr(time, "time", lambda step_s=step_s: wall_s() + step_s)
+            time.sleep(0.2)  # some rounds of the association's own loop
+            assert association.send_c_store(mr_data_set(f"1.2.{abs(int(step_s))}")).Status == 0
+        association.release()
+
+
 def test_four_senders_at_once_lose_nothing(tmp_path):
     def send(number: int) -> None:
         with associated(server.port, calling=f"SENDER{number}") as association:
