@@ -31,6 +31,7 @@ from schemathesis.specs.openapi.checks import (
 from service.access import new_token, token_hash
 from service.client import RoomClient
 
+PATIENCE_S = 300.0
 _FEW, _MANY, _SLOW_ONES = 12, 150, 3
 _NEGATIVE = schemathesis.GenerationMode.NEGATIVE
 _CHECKS = [
@@ -92,11 +93,11 @@ Call = Callable[[Any], Any]
 
 
 def as_nobody(case: Any) -> Any:
-    return case.call()
+    return case.call(timeout=PATIENCE_S)
 
 
 def with_token(token: str) -> Call:
-    return lambda case: case.call(headers={"Authorization": f"Bearer {token}"})
+    return lambda case: case.call(headers={"Authorization": f"Bearer {token}"}, timeout=PATIENCE_S)
 
 
 def fuzz(url: str, examples: int, call: Call = as_nobody) -> list[str]:
