@@ -12,6 +12,7 @@ from dicom_listener.inbox import Envelope, Inbox, is_whole, sha256_of
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.negotiation import VERIFICATION
 from dicom_listener.process import inbox_folder, intake_rules, open_scp
+from dicom_listener.requestor import mended
 from room_config.load import Config
 
 _MIB = 2**20
@@ -74,7 +75,7 @@ def _echo(config: Config) -> Result:
         ae = AE(titles[0] if titles else "CHECK")
         ae.add_requested_context(VERIFICATION)
         host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(config.listener.host, config.listener.host)
-        association = ae.associate(host, scp.port, ae_title=config.listener.ae_title)
+        association = mended(ae.associate(host, scp.port, ae_title=config.listener.ae_title))
         if not association.is_established:
             return "echo", False, f"no association with ourselves on port {scp.port}"
         status = association.send_c_echo()

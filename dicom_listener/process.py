@@ -12,7 +12,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import structlog
 
-from case_record.presence import Presence
+from case_record.presence import Presence, Sole
 from case_record.record import CaseRecord
 from dicom_listener.assign import AssignRules
 from dicom_listener.clock import ClockRules, Sync
@@ -126,6 +126,7 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
     received: SimpleQueue[Path] = SimpleQueue()
     metrics = ListenerMetrics()
     with ExitStack() as stack:
+        stack.enter_context(Sole(config.room.case_dir, "listener"))
         record = stack.enter_context(CaseRecord(config.room.case_dir, create=True))
         inbox = Inbox(
             inbox_folder(config.room.case_dir),
@@ -134,7 +135,6 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         rules = intake_rules(config, time.time())
         scp = open_scp(config.listener, inbox, metrics, received.put)
         stack.callback(scp.stop)
-        # Only now: who holds the port is the only one to write into this inbox.
         discarded = inbox.discard_unfinished()
         metrics.show("associations_open", "Open associations", lambda: scp.open_associations)
         metrics.show("inbox_waiting", "Files not yet in the record", received.qsize)

@@ -21,6 +21,7 @@ from service.bodies import (
     CaseSummary,
     EventBody,
     Health,
+    KnownTarget,
     MeasurementBody,
     SessionBody,
     SliceBody,
@@ -182,8 +183,9 @@ class RoomClient:
         """Clear a latched stop, take the positions as they stand, and arm."""
         self._order("POST", "/api/v1/reset")
 
-    def start_calibration(self) -> int:
-        return self._start("/api/v1/calibration")
+    def start_calibration(self, *, guide: bool | None = None) -> int:
+        """guide: with both fiducials and four axes; None: as the room is configured."""
+        return self._start("/api/v1/calibration", guide=guide)
 
     def set_target(
         self, patient_mm: Sequence[float], *, label: str = "", in_water: bool = False
@@ -196,11 +198,23 @@ class RoomClient:
         """There is no target any more until another one is set."""
         self._order("POST", "/api/v1/target/withdraw")
 
+    def record_target(self, label: str = "") -> int:
+        """The place where the fiducial is now becomes the target."""
+        return self._start("/api/v1/target/here", label=label)
+
+    def targets(self) -> list[KnownTarget]:
+        """Every target of the case."""
+        return self._list("/api/v1/targets", KnownTarget)
+
+    def choose_target(self, number: int) -> None:
+        self._order("POST", f"/api/v1/targets/{number}/choose")
+
     def set_entry(self, patient_mm: Sequence[float]) -> None:
         self._order("PUT", "/api/v1/entry", patient_mm=list(patient_mm))
 
-    def start_approach(self) -> int:
-        return self._start("/api/v1/approach")
+    def start_approach(self, *, guide: bool | None = None) -> int:
+        """guide: to the line from entry to target; None: as the room is configured."""
+        return self._start("/api/v1/approach", guide=guide)
 
     def jog(self, axis: str, distance_um: int) -> int:
         return self._start("/api/v1/jog", axis=axis, distance_um=distance_um)
@@ -225,6 +239,14 @@ class RoomClient:
     def compare_clocks(self, offset_s: float, uncertainty_s: float) -> None:
         """The room's clock minus the scanner's, compared just now."""
         self._order("PUT", "/api/v1/clock", offset_s=offset_s, uncertainty_s=uncertainty_s)
+
+    def forget_clock(self, why: str = "") -> None:
+        """The scanner's clock was set: the next slices show it anew."""
+        self._order("POST", "/api/v1/clock/reset", why=why)
+
+    def give_up_slices(self, hold_id: int, why: str = "") -> None:
+        """No more slices will come of this hold."""
+        self._order("POST", f"/api/v1/holds/{hold_id}/give-up", why=why)
 
     def describe_case(self, label: str, operator: str = "", note: str = "") -> None:
         self._order("PUT", "/api/v1/case", label=label, operator=operator, note=note)

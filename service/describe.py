@@ -18,7 +18,7 @@ from service.alarms import AlarmBook, Condition
 from service.commands import may_start, ready_arrival
 from service.estimate import probability_within
 from service.execution import Execution
-from service.procedures import latest_calibration
+from service.procedures import CALIBRATION, GUIDE_CALIBRATION, latest_calibration
 from service.room_link import RoomLink
 from service.state import (
     AcquisitionState,
@@ -36,7 +36,7 @@ from service.state import (
     RoomState,
     SliceState,
 )
-from service.targets import current_target
+from service.targets import current_entry, current_target
 from sr_engine.geometry import SliceGeometry
 
 PROCESSES = ("listener", "worker")
@@ -67,7 +67,6 @@ class Describer:
         last = record.last_slice()
         shown = record.last_slice("assigned") or last
         target = current_target(record)
-        entry = record.last_event("entry_set")
         target_mm = list(target.patient_mm) if target else None
         arrival = ready_arrival(record)
         measurement = record.last_measurement()
@@ -84,7 +83,7 @@ class Describer:
                 "last_outcome": ""
                 if ended is None
                 else _outcome_text(ended.name, ended.state, ended.result),
-                "prompt": _prompt(record, link, execution, arrival is not None),
+                "prompt": _prompt(config, record, link, execution, arrival is not None),
                 "ready": arrival is not None,
                 "arrival": None if arrival is None else _arrival(*arrival),
                 "punctured": arrival is not None and _punctured(record, arrival[0]),
@@ -106,9 +105,9 @@ class Describer:
                 "measurement": None if measurement is None else _measurement(measurement),
                 **self._around(measurement, before),
                 "clock": _clock(config, record),
-                "calibrated": record.last_procedure("calibration", "done") is not None,
+                "calibrated": _is_calibrated(config, record),
                 "target_patient_mm": tuple(target_mm) if target_mm else None,
-                "entry_patient_mm": tuple(entry.body["patient_mm"]) if entry else None,
+                "entry_patient_mm": current_entry(record),
                 "error": _error(config, record, target_mm),
                 "event_id": record.last_event_id(),
                 "processes": processes,
@@ -170,6 +169,12 @@ def _robot(link: RoomLink, before: RobotState) -> RobotState:
     )
 
 
+def _is_calibrated(config: Config, record: CaseRecord) -> bool:
+    """As the room is used: with the guide's four axes if it has them."""
+    name = CALIBRATION if config.service.guide is None else GUIDE_CALIBRATION
+    return record.last_procedure(name, "done") is not None
+
+
 def _case(record: CaseRecord) -> CaseState | None:
     described = record.last_event("case_described")
     return CaseState(**described.body) if described else None
@@ -197,8 +202,8 @@ def _slice(row: SliceRow) -> SliceState | None:
 
 
 def _arrival(procedure_id: int, result: dict[str, Any]) -> ArrivalState:
-    names = set(ArrivalState.model_fields) - {"procedure_id"}
-    return ArrivalState(procedure_id=procedure_id, **{name: result[name] for name in names})
+    known = {name: result[name] for name in ArrivalState.model_fields if name in result}
+    return ArrivalState(procedure_id=procedure_id, **known)
 
 
 def _punctured(record: CaseRecord, procedure_id: int) -> bool:
@@ -328,13 +333,15 @@ def _error(config: Config, record: CaseRecord, target_mm: list[float] | None) ->
     )
 
 
-def _prompt(record: CaseRecord, link: RoomLink, execution: Execution, ready: bool) -> str:
+def _prompt(
+    config: Config, record: CaseRecord, link: RoomLink, execution: Execution, ready: bool
+) -> str:
     if link.status is None:
         return f"No link to the robot: {link.problem}"
-    return execution.prompt or _idle_prompt(record, link.status, ready)
+    return execution.prompt or _idle_prompt(config, record, link.status, ready)
 
 
-def _idle_prompt(record: CaseRecord, status: BridgeStatus, ready: bool) -> str:
+def _idle_prompt(config: Config, record: CaseRecord, status: BridgeStatus, ready: bool) -> str:
     if ready:
         return "READY: puncture; then say when the needle is out."
     if status.phase is WorkPhase.EMERGENCY:
@@ -343,10 +350,12 @@ def _idle_prompt(record: CaseRecord, status: BridgeStatus, ready: bool) -> str:
         return f"Stopped ({_plain(status.stop_reason)}). Re-arm to go on."
     if not status.armed:
         return "Arm the robot."
-    if record.last_procedure("calibration", "done") is None:
+    if not _is_calibrated(config, record):
         return "Start the calibration."
     if current_target(record) is None:
         return "Set a target."
+    if config.service.guide is not None and current_entry(record) is None:
+        return "Set an entry point."
     return "Start the approach, or set another target."
 
 

@@ -16,10 +16,13 @@ from service.bodies import (
     HoldBody,
     JogBody,
     PointBody,
+    ProcedureBody,
     PunctureBody,
+    ReasonBody,
     Started,
     StopBody,
     TargetBody,
+    TargetHereBody,
 )
 from service.control import ControlLoop
 from service.once import Once
@@ -125,7 +128,7 @@ def command_router(loop: ControlLoop) -> APIRouter:
         return Started(procedure_id=orders.carry_out(caller, key, "jog", body))
 
     @router.post("/api/v1/calibration", tags=["procedure"], status_code=202, responses=_REFUSALS)
-    def calibration(body: Ask, caller: Caller, key: Key = None) -> Started:
+    def calibration(body: ProcedureBody, caller: Caller, key: Key = None) -> Started:
         """Start the calibration."""
         return Started(procedure_id=orders.carry_out(caller, key, "start_calibration", body))
 
@@ -141,13 +144,25 @@ def command_router(loop: ControlLoop) -> APIRouter:
         """Withdraw the target; nothing is approached until another one is set."""
         orders.carry_out(caller, key, "withdraw_target", body)
 
+    @router.post("/api/v1/target/here", tags=["procedure"], status_code=202, responses=_REFUSALS)
+    def target_here(body: TargetHereBody, caller: Caller, key: Key = None) -> Started:
+        """Look as closely as the tolerance asks for: where the fiducial is becomes the target."""
+        return Started(procedure_id=orders.carry_out(caller, key, "record_target", body))
+
+    @router.post(
+        "/api/v1/targets/{number}/choose", tags=["procedure"], status_code=204, responses=_REFUSALS
+    )
+    def choose_target(number: Id, body: Ask, caller: Caller, key: Key = None) -> None:
+        """Take a target of this case again."""
+        orders.carry_out(caller, key, "choose_target", body, number=number)
+
     @router.put("/api/v1/entry", tags=["procedure"], status_code=204, responses=_REFUSALS)
     def entry(body: PointBody, caller: Caller, key: Key = None) -> None:
         """Set the planned skin point, patient mm (LPS)."""
         orders.carry_out(caller, key, "set_entry", body)
 
     @router.post("/api/v1/approach", tags=["procedure"], status_code=202, responses=_REFUSALS)
-    def approach(body: Ask, caller: Caller, key: Key = None) -> Started:
+    def approach(body: ProcedureBody, caller: Caller, key: Key = None) -> Started:
         """Start the approach to the target."""
         return Started(procedure_id=orders.carry_out(caller, key, "start_approach", body))
 
@@ -189,6 +204,15 @@ def clerk_router(loop: ControlLoop) -> APIRouter:
         """The two clocks were compared: slices are assigned by this from now on."""
         orders.carry_out(caller, key, "compare_clocks", body)
 
+    @router.post("/api/v1/clock/reset", tags=["record"], status_code=204, responses=_REFUSALS)
+    def clock_reset(body: ReasonBody, caller: Caller, key: Key = None) -> None:
+        """Forget what was known of the scanner's clock, after it was set or an alarm said so.
+
+        The next slice shows the clock anew, so it must come promptly: first let the scanner send
+        what it still holds back. A comparison (PUT /api/v1/clock) is better where it can be made.
+        """
+        orders.carry_out(caller, key, "forget_clock", body)
+
     @router.put("/api/v1/case", tags=["record"], status_code=204, responses=_REFUSALS)
     def case(body: CaseBody, caller: Caller, key: Key = None) -> None:
         """Write down what the case is called, who operates, and a note."""
@@ -203,6 +227,16 @@ def clerk_router(loop: ControlLoop) -> APIRouter:
     def assignment(slice_id: Id, body: AssignmentBody, caller: Caller, key: Key = None) -> None:
         """Overrule the listener about one slice."""
         orders.carry_out(caller, key, "assign_slice", body, slice_id=slice_id)
+
+    @router.post(
+        "/api/v1/holds/{hold_id}/give-up", tags=["record"], status_code=204, responses=_WITH_ID
+    )
+    def give_up(hold_id: Id, body: ReasonBody, caller: Caller, key: Key = None) -> None:
+        """No more slices will come of this hold: none was acquired that is still on its way.
+
+        Without this, as many acquisitions as it lacks are set aside before one is believed again.
+        """
+        orders.carry_out(caller, key, "give_up_slices", body, hold_id=hold_id)
 
     @router.post("/api/v1/acquisition", tags=["procedure"], status_code=204, responses=_WITH_ID)
     def acquisition(body: HoldBody, caller: Caller, key: Key = None) -> None:

@@ -11,10 +11,10 @@ from fastapi.responses import StreamingResponse
 
 from case_record.record import CaseRecord
 from case_record.rows import SliceRow
-from service.bodies import CaseSummary, EventBody, MeasurementBody, SliceBody
+from service.bodies import CaseSummary, EventBody, KnownTarget, MeasurementBody, SliceBody
 from service.control import ControlLoop
 from service.live import Broadcast
-from service.past import past_cases, targets_over_time
+from service.past import known_targets, past_cases, targets_over_time
 from service.problems import responses
 from service.state import RoomState
 
@@ -130,6 +130,12 @@ def record_router(case_dir: Path) -> APIRouter:
             targets = targets_over_time(record)
         _link(request, response, [row.measurement_id for row in rows], limit)
         return [targets.body_of(row) for row in rows]
+
+    @router.get("/api/v1/targets", responses=_ERRORS)
+    def targets() -> list[KnownTarget]:
+        """Every target of the case in the order in which they were set, with its approaches."""
+        with CaseRecord(case_dir) as record:
+            return known_targets(record)
 
     @router.get("/api/v1/cases", responses=_ERRORS)
     def cases() -> list[CaseSummary]:

@@ -98,7 +98,11 @@ class ErrorState(_Frozen):
 
 
 class ArrivalState(_Frozen):
-    """READY: how the needle guide came to the target, and how sure that is."""
+    """READY: how the needle guide came to the target, and how sure that is.
+
+    With two fiducials the error is that of the needle's tip, and the last fields say where it is:
+    (row, col) in the image plane, depth below the lower ball joint, both points in patient LPS mm.
+    """
 
     procedure_id: int
     measurement_id: int
@@ -108,6 +112,11 @@ class ArrivalState(_Frozen):
     iterations: int
     frames: int
     scan_s: float
+    tip_error_mm: tuple[float, float] | None = None
+    tip_covariance_mm2: tuple[tuple[float, float], tuple[float, float]] | None = None
+    tip_below_joint_mm: float | None = None
+    tip_mm: tuple[float, float, float] | None = None
+    joint_mm: tuple[float, float, float] | None = None
 
 
 class SliceState(_Frozen):
@@ -195,6 +204,7 @@ class RoomState(_Frozen):
     slices: dict[str, int] = {}
     measurement: MeasurementState | None = None
     calibrated: bool = False
+    guide: bool = False
     target_patient_mm: tuple[float, float, float] | None = None
     error: ErrorState | None = None
     tolerance_mm: float
@@ -222,5 +232,6 @@ class RoomState(_Frozen):
             room=config.room.name,
             virtual=config.room.virtual,
             arrival_mode=config.listener.arrival_mode,
+            guide=config.service.guide is not None,
             tolerance_mm=config.service.tolerance_mm,
         )

@@ -47,6 +47,9 @@ def demo(
     fault: Annotated[
         list[str] | None, typer.Option(help=f"One of: {', '.join(known_faults())}.")
     ] = None,
+    guide: Annotated[
+        bool, typer.Option("--guide", help="Two fiducials and four axes: the needle's tip.")
+    ] = False,
     page_port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 0,
     dicom_port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 0,
     tokens: Annotated[
@@ -65,8 +68,9 @@ def demo(
     folder.mkdir(parents=True, exist_ok=True)
     code = INTERRUPTED
     with _signals():
+        faults = tuple(fault or ())
         options = DemoOptions(
-            folder, seed, tuple(fault or ()), page_port, dicom_port, tokens=tokens
+            folder, seed, faults, page_port, dicom_port, tokens=tokens, guide=guide
         )
         code = _run(DemoRoom(options), punctures, leave=exit_, as_json=json_)
     if case is None and code != COULD_NOT:

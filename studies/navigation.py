@@ -129,7 +129,7 @@ def run_group(group: Group) -> GroupResult:
     rng = np.random.default_rng((group.seed, 7))
     try:
         calibration = room.run(calibrate(_calibration_arguments(group)))
-        calibration = room.run(record_place(_recording_arguments(group), calibration))
+        calibration = room.run(record_place(_recording_arguments(group), calibration)).calibration
     except ProcedureFailedError as error:
         return GroupResult(group, (), (str(error),))
     first_mm, target = room.true_plane_mm, calibration.estimate.plane_mm

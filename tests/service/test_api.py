@@ -233,6 +233,22 @@ def test_a_slice_is_set_aside_and_taken_back_and_the_record_says_by_whom(
         client.assign_slice(slice_.slice_id, 99999)
 
 
+def test_a_clock_is_reset_and_slices_are_given_up_and_the_record_says_by_whom_and_why(
+    client: RoomClient, state: RoomState
+) -> None:
+    hold_id = client.slices(state="assigned")[0].hold_id
+    assert hold_id is not None
+    client.forget_clock("the scanner was restarted")
+    client.give_up_slices(hold_id, "the scan was cancelled")
+    said = {e.kind: e for e in client.events()}
+    assert said["clock_reset"].who == said["slices_given_up"].who == "tester"
+    assert said["clock_reset"].body == {"why": "the scanner was restarted"}
+    assert said["slices_given_up"].body["why"] == "the scan was cancelled"
+    assert said["slices_given_up"].body["hold_id"] == hold_id
+    with pytest.raises(RefusedByServiceError, match="no hold 99999"):
+        client.give_up_slices(99999)
+
+
 def test_health_and_metrics_name_every_part(room: AttendedRoom, state: RoomState) -> None:
     health = httpx.get(f"{room.url}/healthz")
     assert health.json() == {
