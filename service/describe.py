@@ -42,7 +42,7 @@ from sr_engine.geometry import SliceGeometry
 PROCESSES = ("listener", "worker")
 _BEAT_IS_OLD_S = 3.0
 _LOOK_EVERY_S = 0.25
-_LOOKED_BACK = 8
+_LOOKED_BACK = 24
 _SAME_SLICE_MM = 0.5
 
 
@@ -56,6 +56,7 @@ class Describer:
         self._alarms = AlarmBook()
         self._processes: list[ProcessState] = []
         self._look_at_s = 0.0
+        self._around_id = 0
 
     def describe(self, execution: Execution, before: RoomState) -> RoomState:
         """Return the present state; the revision grows only if something else than time changed."""
@@ -102,8 +103,7 @@ class Describer:
                 "slices": slices,
                 "slice": None if shown is None else _slice(shown),
                 "measurement": None if measurement is None else _measurement(measurement),
-                "reconstruction": _reconstruction(record, before.reconstruction, measurement),
-                "other_fiducial": _other_fiducial(record, measurement),
+                **self._around(measurement, before),
                 "clock": _clock(config, record),
                 "calibrated": _is_calibrated(config, record),
                 "target_patient_mm": tuple(target_mm) if target_mm else None,
@@ -117,6 +117,16 @@ class Describer:
         state = state.model_copy(update={"alarms": alarms})
         same = state.model_copy(update={"at_s": before.at_s}) == before
         return state.model_copy(update={"revision": before.revision + (not same)})
+
+    def _around(self, last: Measurement | None, before: RoomState) -> dict[str, Any]:
+        """What goes with the newest measurement; looked up once for each."""
+        if last is None or last.measurement_id == self._around_id:
+            return {}
+        self._around_id = last.measurement_id
+        return {
+            "reconstruction": _reconstruction(self._record, before.reconstruction, last),
+            "other_fiducial": _other_fiducial(self._record, last),
+        }
 
     def _look_at_processes(self) -> list[ProcessState]:
         if time.monotonic() >= self._look_at_s:
@@ -217,10 +227,10 @@ def _clock(config: Config, record: CaseRecord) -> ClockState | None:
     return ClockState(offset_s=listener.clock_offset_s, uncertainty_s=listener.clock_uncertainty_s)
 
 
-def _other_fiducial(record: CaseRecord, last: Measurement | None) -> FiducialState | None:
+def _other_fiducial(record: CaseRecord, last: Measurement) -> FiducialState | None:
     """The newest one found at another slice position than the newest measurement's."""
-    at_mm = None if last is None else last.request.get("slice_position_mm")
-    if last is None or at_mm is None:
+    at_mm = last.request.get("slice_position_mm")
+    if at_mm is None:
         return None
     before = record.page_of_measurements(
         after_id=last.measurement_id, limit=_LOOKED_BACK, newest=True
@@ -258,14 +268,22 @@ def _measurement(last: Measurement) -> MeasurementState:
 
 
 def _reconstruction(
-    record: CaseRecord, before: ReconstructionState | None, last: Measurement | None
+    record: CaseRecord, before: ReconstructionState | None, last: Measurement
 ) -> ReconstructionState | None:
-    """The newest measurement's, if it has one; else the one that was shown."""
-    if last is None or not (last.result or {}).get("reconstruction"):
-        return before
-    if before is not None and before.measurement_id == last.measurement_id:
-        return before
-    return reconstruction_state(record, last)
+    """The newest measurement's, if it has one; else the one that was shown, or at a new start of
+    the service the newest of the last ones.
+    """
+    rows = [last]
+    if before is None:
+        rows += record.page_of_measurements(
+            after_id=last.measurement_id, limit=_LOOKED_BACK, newest=True
+        )
+    newest = next(filter(_has_reconstruction, rows), None)
+    return before if newest is None else reconstruction_state(record, newest)
+
+
+def _has_reconstruction(measurement: Measurement) -> bool:
+    return bool((measurement.result or {}).get("reconstruction"))
 
 
 def reconstruction_state(record: CaseRecord, measurement: Measurement) -> ReconstructionState:

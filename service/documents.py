@@ -29,12 +29,12 @@ class Documents:
     def make(self, command: str, case_dir: Path, name: str) -> Path:
         """Return the file `name` that `autospine COMMAND CASE` wrote, alone in its new folder.
 
-        Whoever uses it removes the folder. Raises ProblemError: 503 while another one is being
+        Whoever uses it removes the folder. Raises ProblemError: 429 while another one is being
         made, 409 with the command's own words where it cannot be made.
         """
         if not self._busy.acquire(blocking=False):
             text = "Another report or export is being made: try again in a few seconds."
-            raise ProblemError(503, "busy", text, {"Retry-After": _AGAIN_S})
+            raise ProblemError(429, "busy", text, {"Retry-After": _AGAIN_S})
         folder = Path(tempfile.mkdtemp(prefix="autospine-"))
         try:
             return _written(command, case_dir, folder / name)

@@ -119,7 +119,7 @@ class Broadcast:
         try:
             text, after_id = await asyncio.to_thread(self._missed, after_id)
             yield b"retry: 500\n\n" + text + _state_message(self._loop.state.model_dump_json())
-            shown = self._state_message
+            shown, beaten = self._state_message, self._beat_message
             while True:
                 turn = self._turn
                 if self._events and after_id + 1 < self._events[0][0]:  # a viewer that dawdles
@@ -129,8 +129,11 @@ class Broadcast:
                 if shown is not self._state_message:
                     shown = self._state_message
                     text += shown
-                if text or self._beat_message:
-                    yield text or self._beat_message
+                if beaten is not self._beat_message:
+                    beaten = self._beat_message
+                    text += beaten
+                if text:
+                    yield text
                 # the turn was taken before the text: what comes in between is not waited for
                 await turn.wait()
         finally:

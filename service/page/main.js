@@ -61,7 +61,7 @@ async function pressStop(emergency = false) {
 }
 
 const live = new Live({
-  onState: draw,
+  onState: (state) => { heardFromRoom(state.at_s); draw(state); },
   onEvent: addEvent,
   onClock: heardFromRoom,
   onUp: () => { page.connected = true; showUp(); },

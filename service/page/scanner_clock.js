@@ -10,12 +10,16 @@ const DAY_S = 86400;
 // a person presses within this of the second that is shown (1 sigma of eye and hand, and its rounding)
 const UNCERTAINTY_S = 0.5;
 
-let roomMinusBrowserS = 0;
+const heardS = [];
 
-// The room's clock is that of the service's computer, which need not be this browser's.
+// The room's clock is that of the service's computer, which need not be this browser's. Messages come
+// late by some time or other, never early: the promptest of the last ones tells.
 export function heardFromRoom(nowS) {
-  roomMinusBrowserS = nowS - Date.now() / 1000;
+  heardS.push(nowS - Date.now() / 1000);
+  if (heardS.length > 50) heardS.shift();
 }
+
+const roomMinusBrowserS = () => (heardS.length ? Math.max(...heardS) : 0);
 
 // "10:32:07" -> seconds since midnight, or NaN
 function secondsOf(text) {
@@ -27,7 +31,7 @@ function secondsOf(text) {
 
 // The room's clock minus the scanner's, at this instant; within half a day.
 export function offsetS(shown, pressedMs) {
-  const room = new Date(pressedMs + 1000 * roomMinusBrowserS);
+  const room = new Date(pressedMs + 1000 * roomMinusBrowserS());
   const ofDay = 3600 * room.getHours() + 60 * room.getMinutes() + room.getSeconds() + room.getMilliseconds() / 1000;
   // a clock that shows whole seconds shows, on average, half a second too little
   const difference = ofDay - (secondsOf(shown) + 0.5);

@@ -32,6 +32,14 @@ def running_browser() -> Iterator[Browser]:
             browser.close()
 
 
+def laid_out(page: Page) -> None:
+    """Until what was changed has its place on the screen: observers of sizes act a frame later."""
+    page.evaluate(
+        """() => new Promise((done) => requestAnimationFrame(
+            () => requestAnimationFrame(() => requestAnimationFrame(done))))"""
+    )
+
+
 class Complaints(list[str]):
     """What the page logged as an error; a test that ends with any has failed."""
 
