@@ -78,7 +78,7 @@ export const drawCase = whenChanged(({ description, case_uid, role }) => {
 // Every target that was set in this case: one that was approached before can be taken again.
 export async function drawTargets(role) {
   const targets = (await get("/api/v1/targets")).reverse().slice(0, 30);
-  const table = h("table", {}, h("thead", {}, h("tr", {}, ["Target", "Patient mm (LPS)", "Approached", ""].map((name) => h("th", { scope: "col" }, name)))),
+  const table = h("table", {}, h("thead", {}, h("tr", {}, ["Target", "Patient mm", "Approached", ""].map((name) => h("th", { scope: "col" }, name)))),
     h("tbody", {}, targets.map((one) => h("tr", {},
       h("td", { class: "left" }, one.label || clock(one.set_s), one.in_water ? " (in tissue)" : ""),
       h("td", { class: "left" }, one.patient_mm.map((value) => mm(value)).join(", ")),
@@ -100,7 +100,7 @@ function papersOf(folder) {
 
 export async function drawPast() {
   const cases = await get("/api/v1/cases");
-  const table = h("table", {}, h("thead", {}, h("tr", {}, ["Case", "Begun", "Slices", "Measurements", "Punctures", "To take along"].map((name) => h("th", { scope: "col" }, name)))),
+  const table = h("table", {}, h("thead", {}, h("tr", {}, ["Case", "Begun", "Slices", "Measured", "Punctured", "Papers"].map((name) => h("th", { scope: "col" }, name)))),
     h("tbody", {}, cases.map((one) => h("tr", {},
       h("td", { class: "left" }, one.current ? h("b", {}, one.label || one.folder) : one.label || one.folder),
       h("td", { class: "left" }, one.created_s ? day(one.created_s) : ""),
