@@ -29,13 +29,43 @@ def main() -> None:
     HERE.mkdir(exist_ok=True)
     with (
         tempfile.TemporaryDirectory() as folder,
-        running_room(Path(folder)) as room,
+        running_room(Path(folder) / "cases" / "phantom") as room,
         running_browser() as browser,
         RoomClient(room.url, by="Olga") as client,
     ):
         page = browser.new_page(viewport=SIZE)
         page.goto(room.url)
         take_all(page, room, client)
+    take_guide()
+
+
+def take_guide() -> None:
+    """READY with two fiducials and four axes."""
+    with (
+        tempfile.TemporaryDirectory() as folder,
+        running_room(Path(folder) / "cases" / "guide", guide=True) as room,
+        running_browser() as browser,
+        RoomClient(room.url, by="Olga") as client,
+    ):
+        page = browser.new_page(viewport=SIZE)
+        page.goto(room.url)
+        at_the_guides_ready(client)
+        take(page, "8-guide-ready")
+        page.get_by_role("button", name="Fiducial", exact=True).click()
+        take(page, "8-guide-ready-near")
+
+
+def at_the_guides_ready(client: RoomClient) -> None:
+    arm(client)
+    client.start_calibration()
+    state = wait_for(client.state, lambda s: s.calibrated and s.procedure is None, 300.0)
+    assert state.measurement is not None
+    assert state.measurement.patient_mm is not None
+    x, y, z = state.measurement.patient_mm
+    client.set_entry((x + 1.0, y - 40.0, z + 1.0))
+    client.set_target((x + 3.0, y - 82.0, z - 2.0))
+    client.start_approach()
+    confirm_until_ready(client)
 
 
 def take_all(page: Page, room: AttendedRoom, client: RoomClient) -> None:

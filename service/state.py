@@ -233,5 +233,5 @@ class RoomState(_Frozen):
             virtual=config.room.virtual,
             arrival_mode=config.listener.arrival_mode,
             guide=config.service.guide is not None,
-            tolerance_mm=config.service.tolerance_mm,
+            tolerance_mm=(config.service.guide or config.service).tolerance_mm,
         )

@@ -7,9 +7,10 @@ import { mm } from "./words.js";
 const [WIDE, HIGH, LEFT, BOTTOM, TOP] = [460, 170, 42, 18, 8];
 const MOST = 40;
 
-export const drawHistory = whenChanged(({ measurements, toleranceMm }) => {
+export const drawHistory = whenChanged(({ measurements, toleranceMm, guide }) => {
   const shown = measurements.filter((m) => m.error_mm !== null && m.error_mm !== undefined).slice(-MOST);
   const box = byId("history");
+  if (guide) return replace(box, h("p", { class: "quiet" }, "With two fiducials it is the needle's tip that is steered: its error is shown at READY."));
   if (!shown.length) return replace(box, h("p", { class: "quiet" }, "No measurement with a target yet."));
   const low = Math.min(0.01, toleranceMm / 4);
   const high = Math.max(1, ...shown.map((m) => 1.3 * (m.error_mm + m.sigma_mm)));

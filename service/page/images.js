@@ -51,7 +51,7 @@ export class Images {
         h("button", { type: "button", onclick: () => this.zoomToFiducial() }, "Fiducial")),
       this.picking);
     this.views = h("div", { class: "views" }, this.slice.root, this.sr.root);
-    this.cursor = h("span", {}, " ");
+    this.cursor = h("span", { class: "cursor" }, " ");
     this.ageText = h("span", { id: "image-age" });
     this.source = h("span", {});
     this.pickBar = h("div", { class: "pick", hidden: true });

@@ -75,6 +75,21 @@ export const drawCase = whenChanged(({ description, case_uid, role }) => {
   replace(byId("case"), form, papers, h("p", { class: "quiet" }, `Case ${case_uid || "not begun"}. No patient's name here: the record is exported as it is.`));
 });
 
+// Every target that was set in this case: one that was approached before can be taken again.
+export async function drawTargets(role) {
+  const targets = (await get("/api/v1/targets")).reverse().slice(0, 30);
+  const table = h("table", {}, h("thead", {}, h("tr", {}, ["Target", "Patient mm", "Approached", ""].map((name) => h("th", { scope: "col" }, name)))),
+    h("tbody", {}, targets.map((one) => h("tr", {},
+      h("td", { class: "left" }, one.label || clock(one.set_s), one.in_water ? " (in tissue)" : ""),
+      h("td", { class: "left" }, one.patient_mm.map((value) => mm(value)).join(", ")),
+      h("td", {}, String(one.approaches.length)),
+      h("td", {}, one.current ? h("b", {}, "now") : h("button", {
+        type: "button", disabled: role !== "operator", "aria-label": `Take target ${one.label || clock(one.set_s)} again`,
+        onclick: () => act(() => order("POST", `/api/v1/targets/${one.number}/choose`)),
+      }, "Take again"))))));
+  replace(byId("targets"), targets.length ? table : h("p", { class: "quiet" }, "None yet."));
+}
+
 function papersOf(folder) {
   const of = `?case=${encodeURIComponent(folder)}`;
   return [
@@ -85,7 +100,7 @@ function papersOf(folder) {
 
 export async function drawPast() {
   const cases = await get("/api/v1/cases");
-  const table = h("table", {}, h("thead", {}, h("tr", {}, ["Case", "Begun", "Slices", "Measurements", "Punctures", "To take along"].map((name) => h("th", { scope: "col" }, name)))),
+  const table = h("table", {}, h("thead", {}, h("tr", {}, ["Case", "Begun", "Slices", "Measured", "Punctured", "Papers"].map((name) => h("th", { scope: "col" }, name)))),
     h("tbody", {}, cases.map((one) => h("tr", {},
       h("td", { class: "left" }, one.current ? h("b", {}, one.label || one.folder) : one.label || one.folder),
       h("td", { class: "left" }, one.created_s ? day(one.created_s) : ""),

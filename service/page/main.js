@@ -5,7 +5,7 @@ import { byId, setHidden, setText, whenChanged } from "./dom.js";
 import { drawHead, drawLights, showLost, showUp, startClock } from "./head.js";
 import { drawHistory } from "./history_plot.js";
 import { Images } from "./images.js";
-import { addEvent, drawAlarms, drawAside, drawCase, drawJog, drawPast } from "./lists.js";
+import { addEvent, drawAlarms, drawAside, drawCase, drawJog, drawPast, drawTargets } from "./lists.js";
 import { Live } from "./live.js";
 import { askForToken, leave, whoAmI } from "./login.js";
 import { act, Next } from "./next.js";
@@ -25,7 +25,7 @@ function draw(state) {
   drawHead(state, page.connected);
   next.draw(state, page.role);
   images.draw(state, page.role);
-  drawNumbers({ error: state.error, measurement: state.measurement, tolerance_mm: state.tolerance_mm, arrival: state.arrival, slice: state.slice });
+  drawNumbers({ error: state.error, measurement: state.measurement, tolerance_mm: state.tolerance_mm, arrival: state.arrival, slice: state.slice, guide: state.guide });
   drawStages({ robot: { travel_um: robot.travel_um, positions_um: robot.positions_um, position_certain: robot.position_certain }, plan: question?.plan });
   drawAlarms(state.alarms ?? []);
   drawJog({ positions_um: robot.positions_um, possible: page.role === "operator" && state.jog_possible });
@@ -33,19 +33,21 @@ function draw(state) {
   drawScannerClock({ clock: state.clock, role: page.role });
   drawParts({ robot: { linked: robot.linked, boot_id: robot.boot_id, problem: robot.problem }, processes: state.processes, slices: state.slices });
   newAside([state.slices.quarantined, state.hold?.hold_id, page.role]);
+  newTargets([state.target_patient_mm, state.procedure, page.role]);
   newPast([state.procedure, state.punctured, state.case]);
   newMeasurements([state.measurement?.measurement_id, state.measurement?.state, state.target_patient_mm]);
 }
 
 const quietly = (promise) => promise.catch(() => { /* the stream says when the service is back */ });
 const newAside = whenChanged(() => quietly(drawAside(page.state, page.role)));
+const newTargets = whenChanged(() => quietly(drawTargets(page.role)));
 const newPast = whenChanged(() => quietly(drawPast()));
 const newMeasurements = whenChanged(() => quietly(loadMeasurements()));
 
 async function loadMeasurements() {
   const found = await get("/api/v1/measurements?newest=true&limit=60");
   page.measurements = found.reverse();
-  drawHistory({ measurements: page.measurements, toleranceMm: page.state.tolerance_mm });
+  drawHistory({ measurements: page.measurements, toleranceMm: page.state.tolerance_mm, guide: page.state.guide });
 }
 
 async function pressStop(emergency = false) {

@@ -25,9 +25,9 @@ export function actionsFor(state) {
   } else {
     add("The needle is out: unlock", post("needle-out"), robot.linked && robot.insertion_locked);
   }
-  add("Start the approach", post("approach"), free && state.calibrated && state.target_patient_mm);
+  add("Start the approach", post("approach"), free && state.calibrated && state.target_patient_mm && (!state.guide || state.entry_patient_mm));
   add("Start the calibration", post("calibration"), free);
-  add("Target: where the fiducial is now", "target-here", free && state.calibrated && state.measurement?.patient_mm);
+  add("Target: where the fiducial is now", post("target/here"), free && state.calibrated && !state.guide);
   const wanted = state.acquisition_request;
   add(`The slices of hold ${wanted?.hold_id} were acquired`, post("acquisition", { hold_id: wanted?.hold_id }), state.arrival_mode && wanted);
   add("End the procedure", post("abort"), !idle);
@@ -61,14 +61,14 @@ export class Next {
     drawChips({ linked: state.robot.linked, stopped: state.robot.stopped, armed: state.robot.armed, moving: state.robot.moving, insertion_locked: state.robot.insertion_locked, position_certain: state.robot.position_certain, fault: state.robot.fault });
     setText(byId("prompt-more"), this.more(state));
     this.drawQuestion(state.question, state);
-    this.drawActions([role, actionsFor(state).map((action) => action.label), state.question?.question_id, state.measurement?.measurement_id], state);
+    this.drawActions([role, actionsFor(state).map((action) => action.label), state.question?.question_id], state);
   }
 
   more(state) {
     const wanted = state.acquisition_request;
     if (wanted) return `Position of the robot: hold ${wanted.hold_id}. Slices still wanted: ${wanted.count}.`;
-    if (state.procedure) return `Running: ${state.procedure}.`;
-    return state.last_outcome ? `Last: ${state.last_outcome}.` : "";
+    if (state.procedure) return `Running: ${state.procedure.replaceAll("_", " ")}.`;
+    return state.last_outcome ? `Last: ${state.last_outcome.replace(/^\w+/, (name) => name.replaceAll("_", " "))}.` : "";
   }
 
   actions(state) {
@@ -76,16 +76,13 @@ export class Next {
     const buttons = list.map((action, place) => h("button", {
       type: "button", class: place === 0 && !state.procedure ? "main" : null, disabled: !this.mayAct,
       title: this.mayAct ? null : "Viewers may look and press STOP only.",
-      onclick: () => this.run(action.run, state),
+      onclick: () => this.run(action.run),
     }, action.label));
     replace(byId("actions"), buttons);
   }
 
-  run(what, state) {
+  run(what) {
     if (what === "puncture") return this.askDepth();
-    if (what === "target-here") {
-      return act(() => order("PUT", "/api/v1/target", { patient_mm: state.measurement.patient_mm }));
-    }
     return act(what);
   }
 

@@ -24,10 +24,13 @@ class AttendedRoom(DemoRoom):
     """The demo's room, but it asks before every approach move; `more` ends its file.
 
     tokens: it asks whoever comes for a token, the scanner too; `operator_token` is the operator's.
+    guide: two fiducials and four axes.
     """
 
-    def __init__(self, folder: Path, more: str = "", *, tokens: bool = False) -> None:
-        super().__init__(DemoOptions(folder, seed=3, speed_factor=1.5, tokens=tokens))
+    def __init__(
+        self, folder: Path, more: str = "", *, tokens: bool = False, guide: bool = False
+    ) -> None:
+        super().__init__(DemoOptions(folder, seed=3, speed_factor=1.5, tokens=tokens, guide=guide))
         self._more = more
 
     def _write_config(self, ports: tuple[int, int]) -> Path:
@@ -61,8 +64,10 @@ class AttendedRoom(DemoRoom):
 
 
 @contextmanager
-def running_room(folder: Path, more: str = "", *, tokens: bool = False) -> Iterator[AttendedRoom]:
-    room = AttendedRoom(folder, more, tokens=tokens)
+def running_room(
+    folder: Path, more: str = "", *, tokens: bool = False, guide: bool = False
+) -> Iterator[AttendedRoom]:
+    room = AttendedRoom(folder, more, tokens=tokens, guide=guide)
     try:
         room.start()
         yield room

@@ -16,6 +16,8 @@ from lone_service import CONFIG, running_service
 from room_config.service import AccessToken
 from service.access import Access, AccessRules, LockedOutError, new_token, token_hash
 from service.children import autospine
+from simulator.config import ScannerSettings, VirtualRoomError
+from simulator.scan_operator import read_token
 
 OPERATOR, VIEWER, EXPIRED = new_token(), new_token(), new_token()
 TOKENS = f"""
@@ -285,3 +287,26 @@ def test_a_session_ends_after_its_time() -> None:
     assert access.session(secret, 9.9, 0.0) is not None
     assert access.session(secret, 10.0, 0.0) is None
     assert access.session("another", 1.0, 0.0) is None
+
+
+def test_the_scanner_finds_its_token_in_the_environment_or_in_its_file(tmp_path: Path) -> None:
+    path = tmp_path / "scanner.token"
+    path.write_text("from the file\n")
+
+    def settings(token_file: object) -> ScannerSettings:
+        return ScannerSettings(
+            service_url="http://127.0.0.1:1",
+            listener_port=1,
+            motors_truth_port=1,
+            truth_file="truth",
+            token_file=str(token_file),
+        )
+
+    assert read_token(settings(path), {}) == "from the file"
+    assert read_token(settings(path), {"AUTOSPINE_TOKEN": "from outside"}) == "from outside"
+    assert read_token(settings(""), {}) == ""
+    with pytest.raises(VirtualRoomError, match=r"token_file: .*nowhere: cannot be read"):
+        read_token(settings(tmp_path / "nowhere"), {})
+    path.write_text(" \n")
+    with pytest.raises(VirtualRoomError, match="is empty"):
+        read_token(settings(path), {})

@@ -103,8 +103,11 @@ def test_zoom_by_wheel_by_key_and_by_button_and_both_views_follow(
         return [box["width"] for box in boxes if box is not None]
 
     expect(page.locator(".view >> nth=1 >> .what")).to_contain_text("×2")
+    laid_out(page)
     whole = widths()[0]
     page.mouse.move(*place_of(page, state, 60, 60))
+    laid_out(page)
+    assert widths()[0] == whole, "the image does not jump when the pointer comes in"
     page.mouse.wheel(0, -400)
     wait_for(lambda: widths()[0], lambda width: width > 1.5 * whole)
     page.locator(VIEW).focus()
@@ -160,6 +163,18 @@ def test_an_entry_point_is_picked_moved_by_keys_and_drawn_with_its_line_to_the_t
     page.locator("#set-target").click()
     wait_for(client.state, lambda s: s.target_patient_mm is not None)
     expect(page.locator(f"{VIEW} >> line.c-entry")).to_have_count(1)
+    client.withdraw_target()
+
+
+def test_a_target_of_before_is_taken_again_by_clicking(
+    page: Page, state: RoomState, client: RoomClient
+) -> None:
+    first, second = patient_mm(state, 55, 60), patient_mm(state, 58, 66)
+    client.set_target((first[0], first[1], first[2]), label="the first")
+    client.set_target((second[0], second[1], second[2]), label="the second")
+    expect(page.locator("#targets tr", has_text="the second")).to_contain_text("now")
+    page.get_by_role("button", name="Take target the first again").click()
+    wait_for(client.state, lambda s: s.target_patient_mm == pytest.approx(first))
     client.withdraw_target()
 
 
