@@ -180,7 +180,7 @@ class RoomClient:
         self._ask("POST", "/api/v1/stop", json=body, timeout=_STOP_TIMEOUT_S)
 
     def reset(self) -> None:
-        """Clear a latched stop, take the positions as they stand, and arm."""
+        """Clear a latched stop, take the positions as they stand or are recorded, and arm."""
         self._order("POST", "/api/v1/reset")
 
     def start_calibration(self, *, guide: bool | None = None) -> int:

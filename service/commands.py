@@ -42,7 +42,7 @@ from service.procedures import (
 )
 from service.recording import RecordingArguments
 from service.room_link import RoomLink
-from service.start_point import POSITION_DECLARED, start_point
+from service.start_point import POSITION_DECLARED, positions_to_declare, start_point
 from service.targets import (
     ENTRY_SET,
     TARGET_SET,
@@ -81,12 +81,15 @@ class Commands:
     # Robot
 
     def reset(self, by: str) -> None:
-        """Clear a latched stop, take the positions as they stand, and arm."""
+        """Clear a latched stop, take the positions as they stand or are recorded, and arm."""
         status = self._linked()
         try:
             if not status.position_certain:
-                self._link.client.declare_position(status.positions_um, by)
-                self._note(POSITION_DECLARED, by, {"positions_um": dict(status.positions_um)})
+                positions_um = positions_to_declare(self._record, status.positions_um)
+                self._link.client.declare_position(positions_um, by)
+                counted_um = dict(status.positions_um)
+                body = {"positions_um": positions_um, "counted_um": counted_um}
+                self._note(POSITION_DECLARED, by, body)
             if status.stopped:
                 self._link.client.rearm(by)
             elif not status.armed:

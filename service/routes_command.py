@@ -119,7 +119,10 @@ def command_router(loop: ControlLoop) -> APIRouter:
 
     @router.post("/api/v1/reset", tags=["robot"], status_code=204, responses=_REFUSALS)
     def reset(body: Ask, caller: Caller, key: Key = None) -> None:
-        """Clear a latched stop, take the positions as they stand, and arm."""
+        """Clear a latched stop, take the positions as they stand, and arm.
+
+        Controllers that count from zero again are taken to stand where they were last recorded.
+        """
         orders.carry_out(caller, key, "reset", body)
 
     @router.post("/api/v1/jog", tags=["robot"], status_code=202, responses=_REFUSALS)

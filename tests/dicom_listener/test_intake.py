@@ -1,5 +1,6 @@
 """From the inbox into the record, without a network: many frames, clocks, retention, damage."""
 
+import os
 import time
 from pathlib import Path
 
@@ -172,6 +173,22 @@ def test_a_file_on_which_the_codec_aborts_is_set_aside_and_the_next_is_taken(mak
     start = 144 + int.from_bytes(good[140:144], "little")
     rows = desk.receive(good[start:], jpeg_lossless, sop_instance_uid=uid + ".1")
     assert rows[0].reason_code != "undecodable_pixels"
+
+
+def test_slice_and_folders_are_synced_before_the_inbox_says_that_it_has_them(tmp_path, monkeypatch):
+    """By the rules of fsync: the bytes, the slice's name, and the names of the folders above."""
+    synced, fsync = [], os.fsync
+
+    def watched(descriptor: int) -> None:
+        synced.append(Path(os.readlink(f"/proc/self/fd/{descriptor}")))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watched)
+    inbox = Inbox(tmp_path / "cases" / "first" / "inbox")
+    assert synced == [tmp_path, tmp_path / "cases", tmp_path / "cases" / "first"]
+    body = b"\x08\x00\x05\x00CS\x00\x00"
+    path = inbox.store(body, Envelope("A", "B", "::1", 1, 1e9, 1.0, "1", "2", "3", "ab", len(body)))
+    assert synced[3:] == [path.with_suffix(".part"), path.parent]
 
 
 def test_a_file_that_is_not_ours_in_the_inbox_is_an_alarm_and_no_row(make_desk):

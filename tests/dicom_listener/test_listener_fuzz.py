@@ -99,7 +99,7 @@ def attack(port: int, seed: int, request: bytes) -> None:
 
 
 def pdu_campaign(folder: Path, count: int) -> None:
-    config = write_room(folder, acse_timeout_s=1.0, network_timeout_s=2.0, max_associations=64)
+    config = write_room(folder, acse_timeout_s=5.0, network_timeout_s=10.0, max_associations=64)
     listener = ListenerProcess(config)
     try:
         request = association_request()

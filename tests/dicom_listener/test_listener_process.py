@@ -4,6 +4,7 @@ import json
 import os
 import random
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -294,6 +295,36 @@ def test_check_tries_everything_once(config):
     assert re.findall(r"^ok +(\w+):", ended.stdout, re.M) == ["disk", "write", "clock", "echo"]
 
 
+def test_check_beside_the_running_listener_asks_that_one(tmp_path):
+    with listening(write_room(tmp_path)) as listener:
+        config = write_room(tmp_path, port=listener.port)
+        ended = run_listener(config, "--check")
+        assert ended.returncode == 0, ended.stdout + ended.stderr
+        assert f"by the process that has the port: C-ECHO answered on port {listener.port}" in (
+            ended.stdout
+        )
+
+
+def test_an_alarm_comes_before_the_disk_is_so_full_that_slices_are_refused(tmp_path):
+    free_mib = shutil.disk_usage(tmp_path).free // 2**20
+    with (
+        CaseRecord(tmp_path / "case", create=True) as record,
+        listening(write_room(tmp_path, min_free_mib=free_mib * 3 // 4)) as listener,
+    ):
+        wait_for(lambda: alarms(record) == ["disk_low"])
+        assert send(listener.port, mr_data_set()) == [0]
+
+
+def test_what_was_negotiated_is_in_the_log(config):
+    with listening(config) as listener:
+        send(listener.port, mr_data_set())
+        log_file = listener.log
+    lines = [json.loads(line) for line in log_file.read_text().splitlines()]
+    (said,) = [line["text"] for line in lines if line["event"] == "association"]
+    assert "association of 'SCANNER' (127.0.0.1) to 'AUTOSPINE': accepted" in said
+    assert "MR Image Storage in Explicit VR Little Endian: accepted" in said
+
+
 def test_check_says_when_the_disk_is_low(tmp_path):
     ended = run_listener(write_room(tmp_path, min_free_mib=10**9), "--check")
     assert ended.returncode == 3
@@ -335,9 +366,11 @@ class Sender(threading.Thread):
             for sock in opened:
                 sock.close()
 
-    def expect_no_answer(self) -> None:
+    def end(self) -> None:
         """The peer is dead: end the wait for its answer, which pynetdicom would sit out."""
-        self.messages.put((None, None))  # type: ignore[arg-type]
+        while self.is_alive():
+            self.messages.put((None, None))  # type: ignore[arg-type]
+            self.join(0.05)
 
     def send_all(self, association: Association) -> None:
         dice = random.Random(self.prefix)
@@ -379,8 +412,7 @@ def crash_campaign(folder: Path, kills: int) -> float:
         time.sleep(dice.uniform(0.0, 0.02))
         listener.kill()
         for sender in senders:
-            sender.expect_no_answer()
-            sender.join()
+            sender.end()
             answered |= sender.answered
     print(f"{len(answered)} answered in {kills} runs, slowest restart {slowest_restart_s:.2f} s")
     with listening(config), CaseRecord(folder / "case") as record:

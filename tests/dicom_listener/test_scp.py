@@ -148,7 +148,7 @@ def test_mutual_tls_lets_in_those_with_a_certificate_and_nobody_else(tmp_path):
     files = (tmp_path / "ours.crt", tmp_path / "ours.key", tmp_path / "authority.crt")
     slice_file = tmp_path / "slice.dcm"
     mr_data_set().save_as(slice_file)
-    with serving(tmp_path, tls_context(*files), acse_timeout_s=2.0) as server:
+    with serving(tmp_path, tls_context(*files), acse_timeout_s=30.0) as server:
         address = ("-aec", "AUTOSPINE", "127.0.0.1", server.port)
         trusted = ("+tls", files[1], files[0], "+cf", files[2])
         assert run("echoscu", *trusted, *address).returncode == 0
@@ -239,7 +239,6 @@ def send_raw(association: Association, data_set: bytes, uid: str = "1.2.3.4") ->
     request.AffectedSOPInstanceUID = uid
     request.Priority = 2
     request.DataSet = io.BytesIO(data_set)
-    association.dimse_timeout = 5
     context = association.accepted_contexts[0].context_id
     association._reactor_checkpoint.clear()
     association.dimse.send_msg(request, context)
@@ -317,7 +316,7 @@ def test_no_uid_and_no_title_from_the_network_reaches_a_path(tmp_path):
 
 
 def test_bare_and_silent_connections_hold_nothing_for_long(tmp_path):
-    with serving(tmp_path, acse_timeout_s=0.5, network_timeout_s=1.0) as server:
+    with serving(tmp_path, acse_timeout_s=3.0, network_timeout_s=5.0) as server:
         before = threading.active_count()
         for _ in range(100):  # health checks
             socket.create_connection(("127.0.0.1", server.port)).close()
@@ -347,6 +346,21 @@ def test_an_association_that_falls_silent_is_ended(tmp_path):
         wait_for(lambda: not association.is_established)
         assert association.is_aborted
         wait_for(lambda: server.scp.open_associations == 0)
+
+
+def test_an_association_outlives_that_our_clock_is_set(tmp_path, monkeypatch):
+    with serving(tmp_path) as server:
+        ae = AE("SCANNER")
+        ae.network_timeout = ae.acse_timeout = ae.dimse_timeout = None  # its own timers
+        ae.add_requested_context(MR_IMAGE, [ExplicitVRLittleEndian])
+        association = mended(ae.associate("127.0.0.1", server.port, ae_title="AUTOSPINE"))
+        assert association.send_c_store(mr_data_set("1.2.1")).Status == 0
+        wall_s = time.time
+        for step_s in (3600.0, -3600.0):
+            monkeypatch.setattr(time, "time", lambda step_s=step_s: wall_s() + step_s)
+            time.sleep(0.2)  # some rounds of the association's own loop
+            assert association.send_c_store(mr_data_set(f"1.2.{abs(int(step_s))}")).Status == 0
+        association.release()
 
 
 def test_four_senders_at_once_lose_nothing(tmp_path):

@@ -9,7 +9,8 @@ from service.estimate import MotionNoise
 from service.procedures import APPROACH, CALIBRATION
 from service.procedures import approach_arguments as approach_json
 from service.procedures import calibration_arguments as calibration_json
-from service.start_point import POSITION_DECLARED, start_point
+from service.start_point import POSITION_DECLARED, positions_to_declare, start_point
+from service.steps import MoveTo
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
 from studies.offline_room import MrImaging
@@ -80,3 +81,30 @@ def test_a_measurement_of_an_approach_that_came_to_no_end_does_not_void_every_la
     arguments = approach_arguments(target, confirm_moves=False)
     arrival = room.run_recorded(APPROACH, approach_json(arguments, start))
     assert arrival.probability >= 0.95
+
+
+ZERO = {"xt": 0, "yt": 0}
+
+
+def test_controllers_that_count_from_zero_are_taken_to_stand_where_they_were_recorded(
+    room, calibration
+):
+    room.execute(MoveTo({"xt": 4000, "yt": -2500}, "test"), "one")
+    assert positions_to_declare(room.record, ZERO) == {"xt": 4000, "yt": -2500}
+    # a count that is not lost is believed
+    assert positions_to_declare(room.record, {"xt": 4005, "yt": 0}) == {"xt": 4005, "yt": 0}
+
+
+def test_of_a_move_that_came_to_no_end_half_is_believed(room, calibration):
+    room.execute(MoveTo({"xt": 4000, "yt": -2500}, "test"), "one")
+    room.record.send_move(
+        "two", setpoints_um={"xt": 8000, "yt": -2500}, measurement_id=None, purpose="test"
+    )
+    assert positions_to_declare(room.record, ZERO) == {"xt": 6000, "yt": -2500}
+    room.record.send_move("three", setpoints_um=ZERO, measurement_id=None, purpose="test")
+    assert positions_to_declare(room.record, ZERO) == ZERO
+
+
+def test_a_case_without_holds_takes_the_count(tmp_path):
+    with CaseRecord(tmp_path, create=True) as record:
+        assert positions_to_declare(record, ZERO) == ZERO
