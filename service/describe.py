@@ -213,7 +213,10 @@ def _punctured(record: CaseRecord, procedure_id: int) -> bool:
 
 def _clock(config: Config, record: CaseRecord) -> ClockState | None:
     compared = record.last_event("clock_sync")
+    forgotten = record.last_event("clock_reset")
     listener = config.listener
+    if forgotten is not None and (compared is None or compared.event_id < forgotten.event_id):
+        return None
     if compared is not None:
         offset_s, uncertainty_s = (compared.body[k] for k in ("offset_s", "uncertainty_s"))
         return ClockState(

@@ -60,6 +60,10 @@ export const drawScannerClock = whenChanged(({ clock, role }) => {
       use.hidden = !good;
     },
   }, "It shows this now");
+  const forget = h("button", {
+    type: "button", disabled: role !== "operator", title: "The next slices show it anew; they must come promptly.",
+    onclick: () => act(() => order("POST", "/api/v1/clock/reset", { why: "said on the page" })),
+  }, "It was set anew: forget this");
   replace(byId("scanner-clock"), h("p", { class: "quiet" }, known),
-    h("p", {}, h("label", { htmlFor: "scanner-shows" }, "The scanner shows "), input, " ", compare), said, use);
+    h("p", {}, h("label", { htmlFor: "scanner-shows" }, "The scanner shows "), input, " ", compare), said, use, clock ? h("p", {}, forget) : null);
 });

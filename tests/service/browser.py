@@ -9,6 +9,7 @@ from pathlib import Path
 from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 CHROMIUM = Path("/usr/bin/chromium")
+AXE = Path(__file__).parent / "vendored" / "axe.min.js"
 _PATIENCE_MS = 60_000.0
 _OPTIONS = [
     "--no-sandbox",
@@ -38,6 +39,22 @@ def laid_out(page: Page) -> None:
         """() => new Promise((done) => requestAnimationFrame(
             () => requestAnimationFrame(() => requestAnimationFrame(done))))"""
     )
+
+
+def serious_violations(page: Page) -> list[str]:
+    """What axe finds wrong with the accessibility of what is shown now, in the theme of now."""
+    # the page's own policy forbids foreign scripts, as it should: axe comes in through the debugger
+    page.evaluate(AXE.read_text(encoding="utf-8") + "; null")
+    found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
+    return [
+        f"{v['id']}: {v['nodes'][0]['html'][:120]} {v['nodes'][0].get('failureSummary', '')[:300]}"
+        for v in found["violations"]
+        if v["impact"] in ("serious", "critical")
+    ]
+
+
+def set_theme(page: Page, theme: str) -> None:
+    page.evaluate(f"document.documentElement.dataset.theme = '{theme}'")
 
 
 class Complaints(list[str]):

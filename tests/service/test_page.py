@@ -8,13 +8,12 @@ from pathlib import Path
 import httpx
 import pytest
 from attended_room import AttendedRoom, arm, calibrated, running_room, stop_all, wait_for
-from browser import laid_out
+from browser import laid_out, serious_violations, set_theme
 from playwright.sync_api import Browser, Page, expect
 
 from service.access import new_token, token_hash
 from service.client import RefusedByServiceError, RoomClient
 
-AXE = Path(__file__).parent / "vendored" / "axe.min.js"
 SLOW_MS = 60_000
 STOP_LIMIT_S = 0.5
 STOP_TRIES = 4
@@ -222,6 +221,8 @@ def test_a_viewer_sees_everything_and_can_move_nothing(browser: Browser, tmp_pat
     with running_room(tmp_path, table, tokens=True) as guarded:
         page = browser.new_page()
         page.goto(guarded.url)
+        expect(page.locator("#token")).to_be_visible()
+        assert not serious_violations(page)
         page.locator("#token").fill("wrong")
         button(page, "Log in")
         expect(page.locator("#login-refusal")).to_contain_text("not known")
@@ -257,17 +258,9 @@ def test_a_viewer_sees_everything_and_can_move_nothing(browser: Browser, tmp_pat
 @pytest.mark.parametrize("theme", ["dark", "light"])
 def test_axe_finds_no_serious_violation(page: Page, client: RoomClient, theme: str) -> None:
     calibrated(client)
-    page.evaluate(f"document.documentElement.dataset.theme = '{theme}'")
+    set_theme(page, theme)
     expect(page.locator("#aside")).not_to_be_empty()
-    # the page's own policy forbids foreign scripts, as it should: axe comes in through the debugger
-    page.evaluate(AXE.read_text(encoding="utf-8") + "; null")
-    found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
-    serious = [
-        f"{v['id']}: {v['nodes'][0]['html'][:120]} {v['nodes'][0].get('failureSummary', '')[:300]}"
-        for v in found["violations"]
-        if v["impact"] in ("serious", "critical")
-    ]
-    assert not serious, "\n".join(serious)
+    assert not serious_violations(page)
 
 
 @pytest.mark.parametrize(("width", "height"), [(1280, 800), (3840, 2160), (820, 1180), (1024, 768)])

@@ -10,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 from attended_room import AttendedRoom, arm, calibrated, stop_all, wait_for
-from browser import laid_out
+from browser import laid_out, serious_violations, set_theme
 from lone_service import running_service
 from playwright.sync_api import Browser, Locator, Page, expect
 from test_api_documents import copy_case
@@ -219,6 +219,9 @@ def test_an_emergency_looks_unlike_a_stop_and_says_what_to_do(
     expect(page.locator("#prompt")).to_contain_text("re-arm")
     expect(page.locator("#alarms")).to_contain_text("the drives are parked")
     assert [e.kind for e in client.events()][-20:].count("emergency") == 1
+    for theme in ("dark", "light"):
+        set_theme(page, theme)
+        assert not serious_violations(page)
     page.get_by_role("button", name="Re-arm the robot").click()
     expect(banner).to_be_hidden()
     expect(page.locator("#chips")).to_contain_text("Armed")
@@ -247,7 +250,26 @@ def test_the_clocks_are_compared_by_typing_what_the_scanner_shows(
     assert -37.2 - 0.7 <= event.body["offset_s"] <= -37.2 + 0.7 + pressed_s - read_s
     assert event.body["uncertainty_s"] == 0.5
     expect(card).to_contain_text("by operator")
+    page.get_by_role("button", name="It was set anew: forget this").click()
+    expect(card).to_contain_text("Not compared yet")
     client.compare_clocks(-37.2, 0.02)
+
+
+def test_slices_that_will_not_come_are_given_up_where_slices_were_set_aside(
+    page: Page, state: RoomState, client: RoomClient
+) -> None:
+    arm(client)
+    slice_ = client.slices(state="assigned")[0]
+    client.assign_slice(slice_.slice_id, None, why="a doubtful one")
+    assert slice_.hold_id is not None
+    page.locator("#lacking-hold").fill(str(slice_.hold_id))
+    page.get_by_role("button", name="Give them up").click()
+    given_up = wait_for(
+        lambda: [e for e in client.events() if "given_up" in e.kind or "give" in e.kind],
+        lambda found: found,
+    )
+    assert given_up[-1].who == "operator"
+    client.assign_slice(slice_.slice_id, slice_.hold_id)
 
 
 def test_report_and_export_of_this_case_and_of_others_are_a_click_away(
