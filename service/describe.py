@@ -14,10 +14,10 @@ from case_record.rows import Measurement, SliceRow
 from robot_bridge.client import BridgeStatus
 from room_config.load import Config
 from service.alarms import AlarmBook, Condition
-from service.commands import may_start, ready_arrival
 from service.estimate import probability_within
 from service.execution import Execution
 from service.procedures import CALIBRATION, GUIDE_CALIBRATION, latest_calibration
+from service.readiness import may_start, ready_arrival
 from service.room_link import RoomLink
 from service.state import (
     AcquisitionState,
