@@ -13,8 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from case_record.connection import CaseRecordError
+
 FOLDER = "processes"
 BEAT_EVERY_S = 0.5
+_RETRY_S = 0.05
 
 
 @dataclass(frozen=True)
@@ -51,6 +54,49 @@ class Presence:
             os.close(self._file)
 
     def __enter__(self) -> Presence:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class Sole:
+    """Held by the one process of its name on a case, where two would undo each other's work.
+
+    Raises CaseRecordError where another holds it, and does not let it go within `patience_s`: one
+    that was just killed is still ending.
+    """
+
+    def __init__(self, case_dir: Path, name: str, *, patience_s: float = 2.0) -> None:
+        folder = case_dir / FOLDER
+        folder.mkdir(parents=True, exist_ok=True)
+        # not the file of its presence: whoever looks locks that one for a moment
+        path = folder / f"{name}.sole"
+        self._file = os.open(path, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
+        deadline_s = time.monotonic() + patience_s
+        while not self._lock():
+            if time.monotonic() > deadline_s:
+                other = os.pread(self._file, 20, 0).decode("ascii", "replace").strip() or "unknown"
+                self.close()
+                raise CaseRecordError(
+                    f"{case_dir}: another {name} (process {other}) works on this case"
+                )
+            time.sleep(_RETRY_S)
+        os.ftruncate(self._file, 0)
+        os.pwrite(self._file, f"{os.getpid()}\n".encode(), 0)
+
+    def _lock(self) -> bool:
+        try:
+            fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return False
+        return True
+
+    def close(self) -> None:
+        with contextlib.suppress(OSError):
+            os.close(self._file)
+
+    def __enter__(self) -> Sole:
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -11,7 +11,8 @@ from pynetdicom import AE
 from dicom_listener.inbox import Envelope, Inbox, is_whole, sha256_of
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.negotiation import VERIFICATION
-from dicom_listener.process import inbox_folder, intake_rules, open_scp
+from dicom_listener.process import PortError, inbox_folder, intake_rules, open_scp
+from dicom_listener.requestor import mended
 from room_config.load import Config
 
 _MIB = 2**20
@@ -62,21 +63,32 @@ def _clock() -> Result:
 
 
 def _echo(config: Config) -> Result:
-    """Serve on the configured port and send ourselves a C-ECHO."""
+    """Serve on the configured port and send ourselves a C-ECHO; or to the listener that runs."""
     with tempfile.TemporaryDirectory() as place, ExitStack() as stack:
         inbox = Inbox(Path(place))
-        scp = open_scp(config.listener, inbox, ListenerMetrics(), lambda path: None)
-        scp.start()
-        stack.callback(scp.stop)
+        who = ""
+        try:
+            scp = open_scp(config.listener, inbox, ListenerMetrics(), lambda path: None)
+        except PortError:
+            port, who = config.listener.port, "by the process that has the port: "
+        else:
+            scp.start()
+            stack.callback(scp.stop)
+            port = scp.port
         if config.listener.tls_certificate is not None:
-            return "echo", True, f"port {scp.port} is free (TLS: not tried from here)"
-        titles = config.listener.calling_ae_titles
-        ae = AE(titles[0] if titles else "CHECK")
-        ae.add_requested_context(VERIFICATION)
-        host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(config.listener.host, config.listener.host)
-        association = ae.associate(host, scp.port, ae_title=config.listener.ae_title)
-        if not association.is_established:
-            return "echo", False, f"no association with ourselves on port {scp.port}"
-        status = association.send_c_echo()
-        association.release()
-        return "echo", status.get("Status") == 0, f"C-ECHO answered on port {scp.port}"
+            state = "is in use" if who else "is free"
+            return "echo", True, f"port {port} {state} (TLS: not tried from here)"
+        return _echo_to(config, port, who)
+
+
+def _echo_to(config: Config, port: int, who: str) -> Result:
+    titles = config.listener.calling_ae_titles
+    ae = AE(titles[0] if titles else "CHECK")
+    ae.add_requested_context(VERIFICATION)
+    host = {"0.0.0.0": "127.0.0.1", "::": "::1"}.get(config.listener.host, config.listener.host)
+    association = mended(ae.associate(host, port, ae_title=config.listener.ae_title))
+    if not association.is_established:
+        return "echo", False, f"{who}no association on port {port}"
+    status = association.send_c_echo()
+    association.release()
+    return "echo", status.get("Status") == 0, f"{who}C-ECHO answered on port {port}"

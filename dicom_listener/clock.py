@@ -13,6 +13,8 @@ from dataclasses import dataclass, replace
 
 from dicom_listener.times import AcquisitionInterval
 
+_DRIFT_SLICES = 10
+
 
 @dataclass(frozen=True)
 class ClockRules:
@@ -25,6 +27,7 @@ class ClockRules:
     late_limit_s: a slice that seems to come later than this shows a clock that was set back, or a
     network that stood still, and nothing can tell which.
     drift_ppm: widens a sync as it ages.
+    drift_alarm_s: how far the least lag of late may be from that of the beginning.
     """
 
     prompt_delay_s: float = 3.0
@@ -33,6 +36,7 @@ class ClockRules:
     late_limit_s: float = 120.0
     jump_tolerance_s: float = 0.5
     drift_ppm: float = 50.0
+    drift_alarm_s: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -142,6 +146,33 @@ def observe(
         if delay_s > rules.late_limit_s:
             late = f"received {delay_s:.1f} s after the acquisition, or its clock was set back"
     return Observation(_seen(clock, interval, received_s, rules), late=late)
+
+
+@dataclass(frozen=True)
+class Drift:
+    """The least lags at the beginning and of late, over `_DRIFT_SLICES` slices with certain ends.
+
+    A clock that creeps shows in no single slice. Nor can it be told from slices that have come to
+    take longer; either way the promptness that everything rests on is no longer what it was.
+    """
+
+    first_s: tuple[float, ...] = ()
+    last_s: tuple[float, ...] = ()
+
+    def with_slice(self, interval: AcquisitionInterval, received_s: float) -> "Drift":
+        if interval.end_s is None or interval.estimated:
+            return self
+        lag_s = received_s - interval.end_s
+        if len(self.first_s) < _DRIFT_SLICES:
+            return Drift((*self.first_s, lag_s))
+        return Drift(self.first_s, (*self.last_s, lag_s)[-_DRIFT_SLICES:])
+
+    @property
+    def moved_s(self) -> float:
+        """How much longer the lags have become; 0 until there are enough slices to say."""
+        if len(self.last_s) < _DRIFT_SLICES:
+            return 0.0
+        return min(self.last_s) - min(self.first_s)
 
 
 def _seen(

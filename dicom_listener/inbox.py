@@ -67,7 +67,7 @@ class Inbox:
         self.min_free_bytes = min_free_bytes
         self._counter = itertools.count()
         self._lock = threading.Lock()
-        folder.mkdir(parents=True, exist_ok=True)
+        _make_durably(folder)
 
     def free_bytes(self) -> int:
         return shutil.disk_usage(self.folder).free
@@ -126,6 +126,15 @@ def _write_synced(path: Path, *pieces: bytes) -> None:
         os.fsync(descriptor)
     finally:
         os.close(descriptor)
+
+
+def _make_durably(folder: Path) -> None:
+    """Make a folder and those above it that are missing; their names outlive a power cut."""
+    missing = [path for path in (folder, *folder.parents) if not path.is_dir()]
+    for path in reversed(missing or [folder]):
+        path.mkdir(exist_ok=True)
+        with contextlib.suppress(PermissionError):  # not ours to open, so not made by us either
+            _sync_folder(path.parent)
 
 
 def _sync_folder(folder: Path) -> None:

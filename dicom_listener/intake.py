@@ -4,8 +4,10 @@ Runs in the listener's process, one file after the other. A file whose rows are 
 done; any other in the inbox is taken, also one that was received just before a crash.
 """
 
+import math
 import sqlite3
 import time
+from collections import deque
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from datetime import tzinfo
@@ -15,7 +17,7 @@ from typing import Any
 import structlog
 
 from case_record.record import CaseRecord
-from case_record.rows import Hold, NewSlice, SliceRow
+from case_record.rows import Event, Hold, NewSlice, SliceRow
 from dicom_listener.assign import (
     AssignRules,
     Decision,
@@ -24,12 +26,13 @@ from dicom_listener.assign import (
     Pending,
     assign,
 )
-from dicom_listener.clock import ClockRules, OffsetBounds, ScannerClock, Sync, observe
+from dicom_listener.clock import ClockRules, Sync
 from dicom_listener.decode_guard import DecodeGuard
 from dicom_listener.header import Slice, read_header
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.reasons import Reason, SetAside, UnusableError
+from dicom_listener.scanner_clocks import ScannerClocks
 from dicom_listener.slice_rows import (
     outcome_of,
     row_of,
@@ -71,13 +74,13 @@ class Intake:
         self._rules = rules
         self._metrics = metrics
         self._decoder = DecodeGuard()
-        self._clocks: dict[str, ScannerClock] = {}
-        self._late_scanners: set[str] = set()
+        self._clocks = ScannerClocks(rules.clock, rules.sync)
         self._known: dict[int, Known] = {}
         self._pending: dict[int, Slice] = {}
         self._confirmed: set[int] = set()
         self._done: set[str] = set()
         self._seen_event_id = 0
+        self._unheeded: deque[Event] = deque()
         self._seen_version = -1
         self._remember()
 
@@ -85,13 +88,14 @@ class Intake:
         self._decoder.close()
 
     def _remember(self) -> None:
-        """Rebuild from the record what an earlier run of this process knew."""
+        """Rebuild from the record what an earlier run knew, in the order in which it came."""
         for row in self._record.slices():
             self._done.add(row.path)
+            self._read_events(replaying=True, until_s=row.received_s)
             slice_ = self._slice_of(row)
             if slice_ is None:
                 continue
-            self._observe(slice_, row.received_s)
+            self._clocks.observe(slice_, row.received_s)
             if row.state == "pending":
                 self._pending[row.slice_id] = slice_
             self._know(row.slice_id, slice_, row)
@@ -222,7 +226,9 @@ class Intake:
         except UnusableError as error:
             reason = _without_path(error.reason, path)
             return [row_without_header(envelope, name, reason)], [None]
-        self._observe_first(slices, envelope)
+        for slice_ in slices:
+            for kind, text in self._clocks.observe(slice_, envelope.received_s):
+                self.alarm(kind, text)
         rows: list[NewSlice] = []
         for slice_ in slices:
             against = self._against(slice_, envelope, problems, conflict)
@@ -270,7 +276,7 @@ class Intake:
             received_s,
             self._holds(),
             known,
-            self._offset(slice_, received_s),
+            self._clocks.offset(slice_, received_s),
             self._rules.assign,
         )
 
@@ -292,50 +298,27 @@ class Intake:
         if any(row.reason_code == Reason.UID_CONFLICT for row in rows):
             self.alarm("same_uid_other_bytes", f"{envelope.sop_instance_uid}: both are kept")
 
-    # Clocks
-
-    def _observe_first(self, slices: Sequence[Slice], envelope: Envelope) -> None:
-        for slice_ in slices:
-            for kind, text in self._observe(slice_, envelope.received_s):
-                self.alarm(kind, f"{slice_.scanner}: {text}")
-
-    def _observe(self, slice_: Slice, received_s: float) -> list[tuple[str, str]]:
-        if slice_.interval is None:
-            return []
-        clock = self._clocks.get(slice_.scanner, ScannerClock(sync=self._rules.sync))
-        seen = observe(clock, slice_.interval, received_s, self._rules.clock)
-        self._clocks[slice_.scanner] = seen.clock
-        alarms = [("clock_jump", seen.jump)] if seen.jump else []
-        if seen.late and slice_.scanner not in self._late_scanners:
-            alarms.append(("late_or_clock_jump", seen.late))  # once, until one is prompt again
-        (self._late_scanners.add if seen.late else self._late_scanners.discard)(slice_.scanner)
-        return alarms
-
-    def _offset(self, slice_: Slice, received_s: float) -> OffsetBounds | None:
-        clock = self._clocks.get(slice_.scanner)
-        if clock is None or slice_.interval is None:
-            return None
-        return clock.bounds_for(slice_.interval, received_s, self._rules.clock)
-
     # What the other processes say
 
-    def _read_events(self, *, replaying: bool) -> None:
-        while events := self._record.events(self._seen_event_id, _EVENTS_AT_ONCE):
-            for event in events:
-                self._seen_event_id = event.event_id
-                self._heed(event.kind, event.body, replaying)
+    def _read_events(self, *, replaying: bool, until_s: float = math.inf) -> None:
+        """Heed what was not heeded yet, of what was recorded until an instant."""
+        while self._unheeded or self._fetch_events():
+            if self._unheeded[0].wall_s > until_s:
+                return
+            event = self._unheeded.popleft()
+            self._heed(event.kind, event.body, replaying)
+
+    def _fetch_events(self) -> bool:
+        events = self._record.events(self._seen_event_id, _EVENTS_AT_ONCE)
+        if events:
+            self._seen_event_id = events[-1].event_id
+            self._unheeded.extend(events)
+        return bool(events)
 
     def _heed(self, kind: str, body: Any, replaying: bool) -> None:
+        self._clocks.heed(kind, body)
         if kind == "acquisition_confirmed":
             self._confirmed.add(int(body["hold_id"]))
-        elif kind == "clock_sync":
-            sync = Sync(body["offset_s"], body["uncertainty_s"], body["at_s"])
-            for scanner in self._clocks:
-                self._clocks[scanner] = ScannerClock(sync=sync)
-            self._rules = replace(self._rules, sync=sync)
-        elif kind == "clock_reset":
-            self._clocks.clear()
-            self._rules = replace(self._rules, sync=None)
         elif kind == "slice_reassigned" and not replaying:
             self._follow(self._record.slice(int(body["slice_id"])))
 
@@ -386,32 +369,6 @@ class Intake:
 
     def _event(self, kind: str, body: dict[str, Any]) -> None:
         self._record.append_event(kind, body, source=SOURCE)
-
-
-def reassign(record: CaseRecord, slice_id: int, hold_id: int | None, who: str, why: str) -> None:
-    """An operator overrules: the slice belongs to this hold, or (None) to none. Who is recorded."""
-    with record.transaction():
-        record.decide_slice(
-            slice_id,
-            state="quarantined" if hold_id is None else "assigned",
-            hold_id=hold_id,
-            reason_code="operator" if hold_id is None else "",
-            reason=why if hold_id is None else "",
-            decided_by=who,
-        )
-        body = {"slice_id": slice_id, "hold_id": hold_id, "why": why}
-        record.append_event("slice_reassigned", body, source="operator", who=who)
-
-
-def sync_clock(record: CaseRecord, offset_s: float, uncertainty_s: float, who: str) -> None:
-    """The two clocks were compared now: offset_s is ours minus the scanner's."""
-    body = {"offset_s": offset_s, "uncertainty_s": uncertainty_s, "at_s": time.time()}
-    record.append_event("clock_sync", body, source="operator", who=who)
-
-
-def reset_clock(record: CaseRecord, who: str) -> None:
-    """The scanner's clock was set: forget what was known of it, the next slices show it anew."""
-    record.append_event("clock_reset", {}, source="operator", who=who)
 
 
 def window_of(hold: Hold, confirmed: bool) -> HoldWindow:

@@ -12,7 +12,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import structlog
 
-from case_record.presence import Presence
+from case_record.presence import Presence, Sole
 from case_record.record import CaseRecord
 from dicom_listener.assign import AssignRules
 from dicom_listener.clock import ClockRules, Sync
@@ -26,6 +26,7 @@ from room_config.load import Config, ConfigError
 
 _POLL_S = 0.02
 _HOUSEKEEPING_S = 10.0
+_REMOVAL_S = 600.0  # it reads every row
 _RECORD_RETRY_S = 1.0
 _MIB = 2**20
 
@@ -39,6 +40,10 @@ class Ready:
     port: int
     metrics_port: int | None
     ae_title: str
+
+
+class PortError(ConfigError):
+    """The port cannot be bound: most often another process has it."""
 
 
 def inbox_folder(case_dir: Path) -> Path:
@@ -118,7 +123,7 @@ def open_scp(
         raise ConfigError(f"listener: {error}") from None
     except OSError as error:
         where = f"{config.host}:{config.port}"
-        raise ConfigError(f"listener.port: cannot listen on {where} ({error.strerror})") from None
+        raise PortError(f"listener.port: cannot listen on {where} ({error.strerror})") from None
 
 
 def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]) -> None:
@@ -126,6 +131,7 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
     received: SimpleQueue[Path] = SimpleQueue()
     metrics = ListenerMetrics()
     with ExitStack() as stack:
+        stack.enter_context(Sole(config.room.case_dir, "listener"))
         record = stack.enter_context(CaseRecord(config.room.case_dir, create=True))
         inbox = Inbox(
             inbox_folder(config.room.case_dir),
@@ -134,7 +140,6 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         rules = intake_rules(config, time.time())
         scp = open_scp(config.listener, inbox, metrics, received.put)
         stack.callback(scp.stop)
-        # Only now: who holds the port is the only one to write into this inbox.
         discarded = inbox.discard_unfinished()
         metrics.show("associations_open", "Open associations", lambda: scp.open_associations)
         metrics.show("inbox_waiting", "Files not yet in the record", received.qsize)
@@ -166,7 +171,7 @@ def _loop(
     stop: threading.Event,
     presence: Presence,
 ) -> None:
-    housekeeping_at_s = 0.0
+    housekeeping_at_s = removal_at_s = 0.0
     was_low = False
     while not stop.is_set():
         presence.beat()
@@ -177,7 +182,10 @@ def _loop(
                 intake.note_alarm(*scp.alarms.popleft())
             if time.monotonic() >= housekeeping_at_s:
                 housekeeping_at_s = time.monotonic() + _HOUSEKEEPING_S
-                was_low = _housekeep(intake, inbox, was_low)
+                was_low = _look_at_disk(intake, inbox, was_low)
+            if time.monotonic() >= removal_at_s:
+                removal_at_s = time.monotonic() + _REMOVAL_S
+                intake.remove_old(time.time())
         except sqlite3.Error as error:
             # The slices are safe in the inbox: tried again until the record can be written.
             log.error("the case record cannot be written", error=str(error))
@@ -185,13 +193,12 @@ def _loop(
             _requeue(intake, received)
 
 
-def _housekeep(intake: Intake, inbox: Inbox, was_low: bool) -> bool:
-    """Remove what is past its retention; alarm, once, before the disk is so full as to refuse."""
+def _look_at_disk(intake: Intake, inbox: Inbox, was_low: bool) -> bool:
+    """Alarm, once, before the disk is so full as to refuse; return whether it is low."""
     free_bytes = inbox.free_bytes()
     is_low = free_bytes < 2 * inbox.min_free_bytes
     if is_low and not was_low:
         intake.alarm("disk_low", f"{free_bytes // _MIB} MiB free")
-    intake.remove_old(time.time())
     return is_low
 
 

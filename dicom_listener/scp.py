@@ -176,8 +176,11 @@ class Scp:
         report = report_of(event.assoc)
         self._metrics.associations.labels("accepted").inc()
         self.reports.append(report)
+        text = str(report).replace("\n", "; ")
         if report.anything_refused:
-            self._say("contexts_refused", str(report).replace("\n", "; "))
+            self._say("contexts_refused", text)
+        elif self._is_news("association", text):
+            log.info("association", text=text)
         event.assoc.dul.socket.message_done()
 
     def _on_rejected(self, event: Event) -> None:
@@ -255,14 +258,18 @@ class Scp:
 
     def _say(self, kind: str, text: str) -> None:
         """Log it, and hand it to the record; the same words again only after a while."""
+        if self._is_news(kind, text):
+            self.alarms.append((kind, text))
+            log.warning(kind, text=text)
+
+    def _is_news(self, kind: str, text: str) -> bool:
         now_s = time.monotonic()
         if now_s - self._said_s.get((kind, text), -_SAID_AGAIN_AFTER_S) < _SAID_AGAIN_AFTER_S:
-            return
+            return False
         if len(self._said_s) > _REPORTS_KEPT:
             self._said_s.clear()
         self._said_s[kind, text] = now_s
-        self.alarms.append((kind, text))
-        log.warning(kind, text=text)
+        return True
 
 
 def _failure(status: int, comment: str) -> Dataset:

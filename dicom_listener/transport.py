@@ -19,6 +19,7 @@ from socketserver import TCPServer
 from typing import Any
 
 from pynetdicom.association import Association
+from pynetdicom.timer import Timer
 from pynetdicom.transport import AssociationSocket, RequestHandler, ThreadedAssociationServer
 
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)
@@ -92,6 +93,29 @@ class BoundedSocket(AssociationSocket):
         raise OSError(why)
 
 
+class SteadyTimer(Timer):
+    """pynetdicom's timer by the clock that nobody sets.
+
+    By the wall clock every association would end at once when that is set forward.
+    """
+
+    @property
+    def remaining(self) -> float:
+        if self.timeout is None:
+            return 1  # as pynetdicom's: it never expires
+        if self._start_time is None:
+            return self.timeout
+        now_s = time.monotonic() if self._end_time is None else self._end_time
+        return self.timeout - (now_s - self._start_time)
+
+    def start(self) -> None:
+        self._start_time = time.monotonic()
+        self._end_time: float | None = None
+
+    def stop(self) -> None:
+        self._end_time = time.monotonic()
+
+
 class SharedContexts(list[Any]):
     """Presentation contexts that all associations share: nobody changes them once we serve.
 
@@ -111,6 +135,8 @@ class PromptRequestHandler(RequestHandler):
         association.dul.event_queue.get_nowait()
         bounded = self.server.socket_class(association, self.request)
         association.dul.socket = bounded
+        association.dul._idle_timer = SteadyTimer(association.network_timeout)
+        association.dul.artim_timer = SteadyTimer(association.acse_timeout)
         return association
 
 

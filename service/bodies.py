@@ -103,6 +103,10 @@ class AssignmentBody(Ask):
     why: str = Field(default="", max_length=500)
 
 
+class ReasonBody(Ask):
+    why: str = Field(default="", max_length=500, examples=["the scan was cancelled"])
+
+
 class HoldBody(Ask):
     hold_id: int = Field(ge=1, le=2**53)
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from case_record.record import CaseRecord
-from dicom_listener.intake import reassign
+from dicom_listener.overrule import give_up_slices, reassign, reset_clock
 from robot_bridge.client import BridgeError, BridgeStatus
 from room_config.load import Config
 from room_config.service import GuideConfig
@@ -332,6 +332,15 @@ class Commands:
                 raise ConflictError("no_geometry", f"Slice {slice_id} has no geometry: rescan.")
         reassign(self._record, slice_id, hold_id, by, why or "decided on the page")
 
+    def give_up_slices(self, hold_id: int, why: str, by: str) -> None:
+        """No more slices will come of a hold: the next one need not be scanned again for it."""
+        hold = self._record.hold(hold_id)
+        if hold.ended_at_s is None and self._record.running_procedure() is not None:
+            raise ConflictError(
+                "busy", f"Hold {hold_id} stands and its slices are asked for: end the procedure."
+            )
+        give_up_slices(self._record, hold_id, by, why)
+
     def confirm_acquisition(self, hold_id: int, by: str) -> None:
         """The operator says that the slices of a hold were acquired (rooms in arrival mode)."""
         self._record.hold(hold_id)
@@ -382,6 +391,10 @@ class Commands:
         """The room's clock minus the scanner's, compared just now; the listener heeds the event."""
         body = {"offset_s": offset_s, "uncertainty_s": uncertainty_s, "at_s": time.time()}
         self._note("clock_sync", by, body)
+
+    def forget_clock(self, why: str, by: str) -> None:
+        """The scanner's clock was set, or seemed to be: the next slices show it anew."""
+        reset_clock(self._record, by, why)
 
     # What these have in common
 

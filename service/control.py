@@ -33,7 +33,7 @@ from service.sensing import ProcedureFailedError
 from service.state import RoomState
 from service.targets import ENTRY_SET, TARGET_SET
 
-_TICK_S = 0.005
+_TICK_S = 0.002
 _PUBLISH_EVERY_S = 0.1
 _LEAST_BETWEEN_STATES_S = 0.02
 _PATIENCE_S = 30.0
@@ -46,6 +46,7 @@ _WHILE_MOVING = frozenset(
         "describe_case",
         "assign_slice",
         "confirm_acquisition",
+        "give_up_slices",
         "set_entry",
     }
 )
@@ -193,10 +194,11 @@ class ControlLoop:
         """Serve the bridge and the queue once; called in every wait of every step."""
         if self._closing.is_set():
             raise _Closing
-        self._link.pump(_TICK_S)
         self._answer_queue()
         if self._publish_if_due() and self._commands is not None:
             self._commands.keep_lock()
+        # last: what the waiting step looks at next is fresh, and screens do not delay a decision
+        self._link.pump(_TICK_S)
 
     def _while_moving(self) -> None:
         """Called by the link again and again while it waits for the end of a motion."""

@@ -92,13 +92,30 @@ def targets_over_time(record: CaseRecord) -> Targets:
     )
 
 
+def case_folder(case_dir: Path, name: str | None) -> Path:
+    """The folder of the present case (None) or of one beside it; CaseRecordError if there is none.
+
+    Only names of folders that are there and hold a record lead anywhere: no path gets through.
+    """
+    if name is None:
+        return case_dir
+    for folder in _case_folders(case_dir):
+        if folder.name == name:
+            return folder
+    raise CaseRecordError(f"There is no case in a folder {name!r} beside the present one.")
+
+
+def _case_folders(case_dir: Path) -> list[Path]:
+    beside = (path.parent for path in case_dir.parent.glob(f"*/{FILE_NAME}"))
+    return sorted({case_dir, *beside})[:_MOST_CASES]
+
+
 def past_cases(case_dir: Path) -> list[CaseSummary]:
-    """Every case folder beside `case_dir`, and itself, newest first; others are not touched."""
-    found = [case_dir, *(path.parent for path in case_dir.parent.glob(f"*/{FILE_NAME}"))]
+    """Every case folder beside `case_dir`, and itself, newest first; nothing is written there."""
     summaries = []
-    for folder in sorted(set(found))[:_MOST_CASES]:
+    for folder in _case_folders(case_dir):
         try:
-            with CaseRecord(folder) as record:
+            with CaseRecord(folder, read_only=True) as record:
                 summaries.append(_summary(record, folder, folder == case_dir))
         except CaseRecordError:
             continue  # a record of a newer program, or none: not ours to show

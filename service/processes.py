@@ -2,14 +2,10 @@
 
 from __future__ import annotations
 
-import contextlib
-import json
-import os
 import signal
 import socket
 import sys
 import threading
-from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated
 
@@ -18,13 +14,13 @@ import typer
 import uvicorn
 
 from room_config.load import Config, ConfigError, load_config
-from service.logs import configure_logs
+from room_config.shell import announce, configure_logs, on_parent_gone
 
 ConfigOption = Annotated[Path, typer.Option("--config", help="The room's TOML file.")]
 ParentOption = Annotated[
     bool, typer.Option("--exit-with-parent", help="End when standard input is closed.")
 ]
-_SWITCH_INTERVAL_S = 0.001
+_SWITCH_INTERVAL_S = 0.0002
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
@@ -108,22 +104,3 @@ def check_device(link: str) -> None:
     """ConfigError if the line to the bridge is a device that does not exist."""
     if "://" not in link and not Path(link).exists():
         raise ConfigError(f"key service.bridge_link: there is no device {link}")
-
-
-def announce(facts: dict[str, object]) -> None:
-    """Print the one line by which a supervisor knows that the process is ready."""
-    print(json.dumps({"ready": True, **facts}), flush=True)
-
-
-def on_parent_gone(end: Callable[[], object]) -> None:
-    """Call `end` when standard input is closed: whoever started this process is no more."""
-
-    def wait() -> None:
-        # not sys.stdin: a thread inside its lock would break the interpreter's own exit
-        with contextlib.suppress(OSError):
-            while os.read(0, 4096):
-                pass
-        structlog.get_logger().info("the parent process is gone: ending")
-        end()
-
-    threading.Thread(target=wait, name="parent", daemon=True).start()

@@ -18,6 +18,7 @@ from service.bodies import (
     PointBody,
     ProcedureBody,
     PunctureBody,
+    ReasonBody,
     Started,
     StopBody,
     TargetBody,
@@ -206,6 +207,15 @@ def clerk_router(loop: ControlLoop) -> APIRouter:
         """The two clocks were compared: slices are assigned by this from now on."""
         orders.carry_out(caller, key, "compare_clocks", body)
 
+    @router.post("/api/v1/clock/reset", tags=["record"], status_code=204, responses=_REFUSALS)
+    def clock_reset(body: ReasonBody, caller: Caller, key: Key = None) -> None:
+        """Forget what was known of the scanner's clock, after it was set or an alarm said so.
+
+        The next slice shows the clock anew, so it must come promptly: first let the scanner send
+        what it still holds back. A comparison (PUT /api/v1/clock) is better where it can be made.
+        """
+        orders.carry_out(caller, key, "forget_clock", body)
+
     @router.put("/api/v1/case", tags=["record"], status_code=204, responses=_REFUSALS)
     def case(body: CaseBody, caller: Caller, key: Key = None) -> None:
         """Write down what the case is called, who operates, and a note."""
@@ -220,6 +230,16 @@ def clerk_router(loop: ControlLoop) -> APIRouter:
     def assignment(slice_id: Id, body: AssignmentBody, caller: Caller, key: Key = None) -> None:
         """Overrule the listener about one slice."""
         orders.carry_out(caller, key, "assign_slice", body, slice_id=slice_id)
+
+    @router.post(
+        "/api/v1/holds/{hold_id}/give-up", tags=["record"], status_code=204, responses=_WITH_ID
+    )
+    def give_up(hold_id: Id, body: ReasonBody, caller: Caller, key: Key = None) -> None:
+        """No more slices will come of this hold: none was acquired that is still on its way.
+
+        Without this, as many acquisitions as it lacks are set aside before one is believed again.
+        """
+        orders.carry_out(caller, key, "give_up_slices", body, hold_id=hold_id)
 
     @router.post("/api/v1/acquisition", tags=["procedure"], status_code=204, responses=_WITH_ID)
     def acquisition(body: HoldBody, caller: Caller, key: Key = None) -> None:

@@ -69,6 +69,23 @@ class MeasurementState(_Frozen):
     has_reconstruction: bool = False
 
 
+class FiducialState(_Frozen):
+    """The guide's other fiducial, where it was last seen (in another slice than the newest)."""
+
+    measurement_id: int
+    patient_mm: tuple[float, float, float]
+    radius_mm: float
+
+
+class ClockState(_Frozen):
+    """How the scanner's clock goes: ours minus the scanner's; compared_s None: as configured."""
+
+    offset_s: float
+    uncertainty_s: float
+    compared_s: float | None = None
+    who: str = ""
+
+
 class ErrorState(_Frozen):
     """How far the fiducial is from the target, in the image plane (row, col) mm."""
 
@@ -196,6 +213,8 @@ class RoomState(_Frozen):
     case: CaseState | None = None
     slice: SliceState | None = None
     reconstruction: ReconstructionState | None = None
+    other_fiducial: FiducialState | None = None
+    clock: ClockState | None = None
     hold: HoldState | None = None
     entry_patient_mm: tuple[float, float, float] | None = None
     punctured: bool = False

@@ -12,9 +12,8 @@ import structlog
 import typer
 
 from room_config.load import load_config
+from room_config.shell import announce, configure_logs, on_parent_gone
 from service.children import ChildError, Family, autospine, quiet_environment
-from service.logs import configure_logs
-from service.processes import announce, on_parent_gone
 
 app = typer.Typer(add_completion=False)
 _PROCESSES = ("listener", "worker", "service")

@@ -60,9 +60,14 @@ class Operator:
     """Drives a case to the wanted number of punctures through the API alone."""
 
     def __init__(
-        self, url: str, room: VirtualRoom, truth: TruthAddress, results_file: Path, seed: int
+        self,
+        client: RoomClient,
+        room: VirtualRoom,
+        truth: TruthAddress,
+        results_file: Path,
+        seed: int,
     ) -> None:
-        self._client = RoomClient(url, by=WHO)
+        self._client = client
         self._room = room
         self._truth = truth
         self._results_file = results_file

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from service.access import new_token, token_hash
 from service.children import ChildError, Family, autospine
 from simulator.config import VirtualRoom, parse_virtual_room
 from simulator.faults import FAULTS
@@ -28,7 +29,10 @@ _CLOCK_OFFSET_S = 37.2
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """What the user chose; port 0 means any free one. guide: two fiducials and four axes."""
+    """What the user chose; port 0 means any free one.
+
+    tokens: the room asks for tokens. guide: two fiducials and four axes.
+    """
 
     case_dir: Path
     seed: int
@@ -36,6 +40,7 @@ class DemoOptions:
     page_port: int = 0
     dicom_port: int = 0
     speed_factor: float = 3.0
+    tokens: bool = False
     guide: bool = False
 
 
@@ -57,6 +62,7 @@ class DemoRoom:
         self.url = ""
         self.truth_port = 0
         self.virtual_table: dict[str, Any] = {}
+        self.operator_token = new_token() if options.tokens else ""
 
     @property
     def axes(self) -> tuple[str, ...]:
@@ -151,6 +157,7 @@ class DemoRoom:
                 "motors_truth_port": self.truth_port,
                 "truth_file": str(self.truth_file),
                 "clock_offset_s": _CLOCK_OFFSET_S,
+                **({"token_file": str(self._token_file)} if self.options.tokens else {}),
             },
         }
         if self.options.guide:
@@ -195,8 +202,28 @@ class DemoRoom:
         path = self.folder / _CONFIG
         text = "# Written by `autospine demo`.\n" + _toml(tables)
         text += "".join(f"\n[[bridge.axis]]\n{_toml_keys(axis)}" for axis in axes)
+        text += "".join(f"\n[[service.token]]\n{_toml_keys(t)}" for t in self._token_tables())
         path.write_text(text, encoding="utf-8")
         return path
+
+    def _token_tables(self) -> list[dict[str, str]]:
+        """Who may use the service; the scanner finds its own token in its file."""
+        if not self.options.tokens:
+            return []
+        scanner_token = new_token()
+        self._token_file.touch(mode=0o600)
+        self._token_file.write_text(scanner_token, encoding="ascii")
+        return [
+            {"name": name, "role": role, "sha256": token_hash(token)}
+            for name, role, token in (
+                ("operator", "operator", self.operator_token),
+                ("scanner", "viewer", scanner_token),
+            )
+        ]
+
+    @property
+    def _token_file(self) -> Path:
+        return self.virtual_dir / "scanner.token"
 
     def _axis_table(self, name: str, address: int) -> dict[str, Any]:
         return {

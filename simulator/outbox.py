@@ -16,6 +16,7 @@ from pynetdicom import AE
 from pynetdicom.association import Association
 from pynetdicom.sop_class import EnhancedMRImageStorage, MRImageStorage
 
+from dicom_listener.requestor import mended
 from simulator.config import ScannerSettings
 
 _TRANSFER_SYNTAXES = [ExplicitVRLittleEndian, ImplicitVRLittleEndian]
@@ -137,8 +138,10 @@ def _associate(settings: ScannerSettings) -> Association:
     entity.acse_timeout = entity.dimse_timeout = entity.network_timeout = 10
     for sop_class in (MRImageStorage, EnhancedMRImageStorage):
         entity.add_requested_context(sop_class, _TRANSFER_SYNTAXES)
-    return entity.associate(
-        settings.listener_host, settings.listener_port, ae_title=settings.listener_ae_title
+    return mended(
+        entity.associate(
+            settings.listener_host, settings.listener_port, ae_title=settings.listener_ae_title
+        )
     )
 
 

@@ -186,3 +186,32 @@ def test_three_processes_append_at_once_and_the_chain_holds(record):
         writer.join()
     assert record.verify_events() == 150
     assert record.data_version() != version
+
+
+def test_after_a_full_disk_the_error_is_named_and_the_next_change_is_durable(tmp_path):
+    with CaseRecord(tmp_path, create=True) as record:
+        pages = record._db.execute("PRAGMA page_count").fetchone()[0]
+        record._db.execute(f"PRAGMA max_page_count = {pages}")
+        with pytest.raises(sqlite3.OperationalError, match="full"):
+            record.append_event("note", {"text": "x" * 100_000}, source="test")
+        record._db.execute("PRAGMA max_page_count = 1000000")
+        record.append_event("note", {"text": "after"}, source="test")
+        with CaseRecord(tmp_path) as other:
+            assert [event.body["text"] for event in other.events()] == ["after"]
+            assert other.verify_events() == 1
+
+
+def _end_with_a_step_of_no_procedure(record: CaseRecord) -> None:
+    with record.transaction():
+        record._db.execute("PRAGMA defer_foreign_keys = ON")
+        record.send_step(4711, 0, "measure", {})
+
+
+def test_where_the_commit_fails_nothing_stays_open(tmp_path):
+    """A deferred foreign key is checked at the commit: it fails there, and nowhere before."""
+    with CaseRecord(tmp_path, create=True) as record:
+        with pytest.raises(sqlite3.IntegrityError):
+            _end_with_a_step_of_no_procedure(record)
+        record.append_event("note", {}, source="test")
+        with CaseRecord(tmp_path) as other:
+            assert [event.kind for event in other.events()] == ["note"]

@@ -173,7 +173,7 @@ class ListenerProcess:
             assert self.process.stdin is not None
             self.process.stdin.close()
         try:
-            self.process.wait(10)
+            self.process.wait(60)
         except subprocess.TimeoutExpired:
             self.process.kill()
         self._reap()
@@ -196,7 +196,7 @@ def listening(config: Path) -> Iterator[ListenerProcess]:
         process.end()
 
 
-def wait_for(condition: Any, timeout_s: float = 10.0) -> None:
+def wait_for(condition: Any, timeout_s: float = 120.0) -> None:
     deadline_s = time.monotonic() + timeout_s
     while not condition():
         assert time.monotonic() < deadline_s, "waited in vain"

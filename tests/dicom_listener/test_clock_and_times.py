@@ -8,16 +8,17 @@ from zoneinfo import ZoneInfo
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from listener_room import mr_data_set
+from listener_room import a_slice, mr_data_set
 from pydicom import dcmread
 from pydicom.config import disable_value_validation
 from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset
 from pydicom.sequence import Sequence
 
-from dicom_listener.clock import ClockRules, ScannerClock, Sync, observe
+from dicom_listener.clock import ClockRules, Drift, ScannerClock, Sync, observe
 from dicom_listener.elements import Elements, frame_elements
 from dicom_listener.header import slices_of
+from dicom_listener.scanner_clocks import ScannerClocks
 from dicom_listener.times import (
     AcquisitionInterval,
     ImplausibleTimeError,
@@ -279,3 +280,34 @@ def test_a_slice_without_a_duration_bounds_the_offset_by_the_longest_acquisition
     bounds = clock.bounds_for(interval, 1005.0, RULES)
     assert bounds.high_s == pytest.approx(5.0)
     assert bounds.low_s == pytest.approx(5.0 - RULES.longest_acquisition_s - RULES.prompt_delay_s)
+
+
+def kinds_of_a_session(drift_per_slice_s: float, n_slices: int = 60) -> list[str]:
+    """Alarms over a session of a slice every 10 s whose clock creeps; delays vary by 0.4 s."""
+    clocks, kinds = ScannerClocks(ClockRules(), None), []
+    for number in range(n_slices):
+        end_s = 1000.0 + 10.0 * number
+        by_scanner_s = end_s - drift_per_slice_s * number
+        interval = AcquisitionInterval(by_scanner_s - 2.0, by_scanner_s, "AcquisitionDateTime")
+        received_s = end_s + 0.5 + 0.1 * (number % 5)
+        alarms = clocks.observe(a_slice(interval=interval), received_s)
+        kinds += [kind for kind, _ in alarms]
+    return kinds
+
+
+@pytest.mark.parametrize("drift_per_slice_s", [0.04, -0.04])
+def test_a_clock_that_creeps_is_one_alarm(drift_per_slice_s):
+    assert kinds_of_a_session(drift_per_slice_s) == ["clock_drift"]
+
+
+@pytest.mark.parametrize("drift_per_slice_s", [0.0, 0.0005, -0.0005])  # 50 ppm is what clocks do
+def test_a_clock_as_good_as_clocks_are_is_no_alarm(drift_per_slice_s):
+    assert kinds_of_a_session(drift_per_slice_s) == []
+
+
+def test_only_certain_ends_count_for_a_drift():
+    drift = Drift()
+    for number in range(20):
+        drift = drift.with_slice(acquired(1000.0 + number), 1003.0 + 2 * number)
+    assert drift.moved_s == pytest.approx(10.0)
+    assert drift.with_slice(acquired(1000.0, None), 2000.0) == drift  # an end that is not certain

@@ -1,5 +1,6 @@
 """From the inbox into the record, without a network: many frames, clocks, retention, damage."""
 
+import os
 import time
 from pathlib import Path
 
@@ -13,8 +14,9 @@ from pydicom.sequence import Sequence
 from case_record.record import CaseRecord
 from dicom_listener.clock import ClockRules
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope, sha256_of
-from dicom_listener.intake import Intake, IntakeRules, sync_clock
+from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.overrule import give_up_slices, reset_clock, sync_clock
 from dicom_listener.quirks import ENHANCED_MR_IMAGE
 from dicom_listener.usable import SliceRules
 
@@ -173,6 +175,22 @@ def test_a_file_on_which_the_codec_aborts_is_set_aside_and_the_next_is_taken(mak
     assert rows[0].reason_code != "undecodable_pixels"
 
 
+def test_slice_and_folders_are_synced_before_the_inbox_says_that_it_has_them(tmp_path, monkeypatch):
+    """By the rules of fsync: the bytes, the slice's name, and the names of the folders above."""
+    synced, fsync = [], os.fsync
+
+    def watched(descriptor: int) -> None:
+        synced.append(Path(os.readlink(f"/proc/self/fd/{descriptor}")))
+        fsync(descriptor)
+
+    monkeypatch.setattr(os, "fsync", watched)
+    inbox = Inbox(tmp_path / "cases" / "first" / "inbox")
+    assert synced == [tmp_path, tmp_path / "cases", tmp_path / "cases" / "first"]
+    body = b"\x08\x00\x05\x00CS\x00\x00"
+    path = inbox.store(body, Envelope("A", "B", "::1", 1, 1e9, 1.0, "1", "2", "3", "ab", len(body)))
+    assert synced[3:] == [path.with_suffix(".part"), path.parent]
+
+
 def test_a_file_that_is_not_ours_in_the_inbox_is_an_alarm_and_no_row(make_desk):
     desk = make_desk()
     stray = desk.inbox.folder / "stray.dcm"
@@ -193,3 +211,56 @@ def test_a_damaged_envelope_is_told_from_a_whole_one(make_desk):
     path.write_bytes(whole[:150] + b"\xff" * 40 + whole[190:])
     with pytest.raises(NotFromInboxError):
         read_envelope(path)
+
+
+def test_a_hold_whose_slices_were_given_up_costs_no_extra_scan(make_desk):
+    desk = make_desk()
+    first = begin_hold(desk.record, time.time() - 20, expected=1)
+    desk.record.end_open_hold(time.time() - 10)
+    begin_hold(desk.record, time.time() - 9, expected=3, set_id=2)
+    (doubted,) = desk.receive(mr_data_set("1.2.1", began_s=time.time() - 0.6))
+    assert doubted.reason_code == "may_belong_to_incomplete_hold"
+    with CaseRecord(desk.record.case_dir) as service:
+        assert give_up_slices(service, first, "anna", "the scan was cancelled") == 1
+        event = service.last_event("slices_given_up")
+    assert (event.who, event.body["why"]) == ("anna", "the scan was cancelled")
+    assert (event.body["expected"], event.body["there"]) == (1, 0)
+    assert desk.record.hold(first).expected_slices == 0
+    taken = mr_data_set("1.2.2", began_s=time.time() - 0.6)
+    taken.AcquisitionNumber = 2
+    assert desk.receive(taken)[0].state == "assigned"
+
+
+def test_without_giving_up_the_hold_costs_one_scan_and_no_more(make_desk):
+    desk = make_desk()
+    begin_hold(desk.record, time.time() - 20, expected=1)
+    desk.record.end_open_hold(time.time() - 10)
+    begin_hold(desk.record, time.time() - 9, expected=3, set_id=2)
+    codes = []
+    for number in (1, 2):
+        data_set = mr_data_set(f"1.2.{number}", began_s=time.time() - 0.6)
+        data_set.AcquisitionNumber = number
+        codes.append(desk.receive(data_set)[0].reason_code)
+    assert codes == ["may_belong_to_incomplete_hold", ""]
+
+
+def test_giving_up_a_complete_hold_changes_nothing(make_desk):
+    desk = make_desk()
+    hold_id = begin_hold(desk.record, time.time() - 5, expected=1)
+    desk.receive(mr_data_set("1.2.1", began_s=time.time() - 0.6))
+    assert give_up_slices(desk.record, hold_id, "anna", "") == 0
+    assert desk.record.hold(hold_id).expected_slices == 1
+
+
+def test_what_was_learnt_of_a_clock_after_its_reset_outlives_a_restart(make_desk):
+    """Slices and resets are replayed in the order in which they came."""
+    desk = make_desk()
+    begin_hold(desk.record, time.time() - 60, expected=9)
+    desk.receive(mr_data_set("1.2.1", began_s=time.time() - 500.6))
+    reset_clock(desk.record, "anna", "it had been set")
+    (taken,) = desk.receive(mr_data_set("1.2.2", began_s=time.time() - 0.6))
+    assert taken.state == "assigned"
+    again = make_desk()
+    late = mr_data_set("1.2.3", began_s=time.time() - 200.6)
+    (row,) = again.receive(late)
+    assert row.reason_code == "late_or_clock_jump"  # by the slice that came after the reset

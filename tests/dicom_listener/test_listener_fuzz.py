@@ -18,6 +18,7 @@ from dicom_listener.header import read_header
 from dicom_listener.inbox import Envelope, Inbox, sha256_of
 from dicom_listener.quirks import MR_IMAGE
 from dicom_listener.reasons import Reason, UnusableError
+from dicom_listener.requestor import mended
 from dicom_listener.usable import SliceRules, why_not_usable
 
 # Seeds that once did harm: a codec that panicked, one that aborted the process.
@@ -98,7 +99,7 @@ def attack(port: int, seed: int, request: bytes) -> None:
 
 
 def pdu_campaign(folder: Path, count: int) -> None:
-    config = write_room(folder, acse_timeout_s=1.0, network_timeout_s=2.0, max_associations=64)
+    config = write_room(folder, acse_timeout_s=5.0, network_timeout_s=10.0, max_associations=64)
     listener = ListenerProcess(config)
     try:
         request = association_request()
@@ -106,11 +107,11 @@ def pdu_campaign(folder: Path, count: int) -> None:
             attack(listener.port, seed, request)
         ae = AE("SCANNER")
         ae.add_requested_context(MR_IMAGE)
-        association = ae.associate("127.0.0.1", listener.port, ae_title="AUTOSPINE")
+        association = mended(ae.associate("127.0.0.1", listener.port, ae_title="AUTOSPINE"))
         assert association.is_established
         assert association.send_c_store(mr_data_set()).Status == 0
         association.release()
-        wait_for(lambda: threads_of(listener.process.pid) < 12, 20.0)
+        wait_for(lambda: threads_of(listener.process.pid) < 12)
         assert listener.process.poll() is None
     finally:
         listener.end()
@@ -145,7 +146,7 @@ def test_mangled_data_sets_in_the_inbox_all_reach_the_record(tmp_path):
     listener = ListenerProcess(config)
     try:
         with CaseRecord(tmp_path / "case") as record:
-            wait_for(lambda: len({r.sop_instance_uid for r in record.slices()}) == count, 30)
+            wait_for(lambda: len({r.sop_instance_uid for r in record.slices()}) == count)
             assert all(row.state == "quarantined" for row in record.slices())
             assert all(row.reason for row in record.slices())
             kinds = [event.body["alarm"] for event in record.events() if event.kind == "alarm"]

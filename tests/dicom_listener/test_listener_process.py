@@ -4,6 +4,7 @@ import json
 import os
 import random
 import re
+import shutil
 import signal
 import socket
 import subprocess
@@ -29,10 +30,11 @@ from pynetdicom.association import Association
 from case_record.record import CaseRecord
 from dicom_listener.header import read_header
 from dicom_listener.inbox import is_whole, read_envelope
-from dicom_listener.intake import reassign, reset_clock
+from dicom_listener.overrule import reassign, reset_clock
 from dicom_listener.pixels import magnitude_pixels
 from dicom_listener.process import run
 from dicom_listener.quirks import MR_IMAGE
+from dicom_listener.requestor import mended
 from dicom_listener.slice_rows import slice_from_record
 from room_config.load import ConfigError, load_config
 
@@ -54,7 +56,7 @@ def send(port: int, *data_sets) -> list[int]:
     """Statuses of a C-STORE of each; -1 where no answer came."""
     ae = AE("SCANNER")
     ae.add_requested_context(MR_IMAGE, [ExplicitVRLittleEndian])
-    association = ae.associate("127.0.0.1", port, ae_title="AUTOSPINE")
+    association = mended(ae.associate("127.0.0.1", port, ae_title="AUTOSPINE"))
     assert association.is_established
     statuses = [association.send_c_store(d).get("Status", -1) for d in data_sets]
     association.release()
@@ -233,7 +235,7 @@ def test_no_patient_is_in_the_log_or_in_the_record(config, record):
 
 def run_listener(config: Path, *words: str) -> subprocess.CompletedProcess[str]:
     command = [sys.executable, "-m", "dicom_listener.command_line", "--config", str(config), *words]
-    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=60)
+    return subprocess.run(command, capture_output=True, text=True, cwd=ROOT, timeout=300)
 
 
 def test_a_bad_configuration_ends_with_code_2_and_one_line(tmp_path):
@@ -274,10 +276,53 @@ def test_a_port_in_use_ends_with_code_2_and_one_line(tmp_path, config):
         assert len(ended.stderr.strip().splitlines()) == 1
 
 
+def test_a_second_listener_on_the_same_case_ends_with_code_2_and_one_line(config):
+    with listening(config) as listener:
+        ended = run_listener(config)
+        assert ended.returncode == 2
+        assert "another listener" in ended.stderr
+        assert str(listener.process.pid) in ended.stderr
+        assert len(ended.stderr.strip().splitlines()) == 1
+        assert send(listener.port, mr_data_set()) == [0]
+        listener.kill()
+    with listening(config) as listener:
+        assert send(listener.port, mr_data_set("1.2.826.0.5")) == [0]
+
+
 def test_check_tries_everything_once(config):
     ended = run_listener(config, "--check")
     assert ended.returncode == 0, ended.stdout + ended.stderr
     assert re.findall(r"^ok +(\w+):", ended.stdout, re.M) == ["disk", "write", "clock", "echo"]
+
+
+def test_check_beside_the_running_listener_asks_that_one(tmp_path):
+    with listening(write_room(tmp_path)) as listener:
+        config = write_room(tmp_path, port=listener.port)
+        ended = run_listener(config, "--check")
+        assert ended.returncode == 0, ended.stdout + ended.stderr
+        assert f"by the process that has the port: C-ECHO answered on port {listener.port}" in (
+            ended.stdout
+        )
+
+
+def test_an_alarm_comes_before_the_disk_is_so_full_that_slices_are_refused(tmp_path):
+    free_mib = shutil.disk_usage(tmp_path).free // 2**20
+    with (
+        CaseRecord(tmp_path / "case", create=True) as record,
+        listening(write_room(tmp_path, min_free_mib=free_mib * 3 // 4)) as listener,
+    ):
+        wait_for(lambda: alarms(record) == ["disk_low"])
+        assert send(listener.port, mr_data_set()) == [0]
+
+
+def test_what_was_negotiated_is_in_the_log(config):
+    with listening(config) as listener:
+        send(listener.port, mr_data_set())
+        log_file = listener.log
+    lines = [json.loads(line) for line in log_file.read_text().splitlines()]
+    (said,) = [line["text"] for line in lines if line["event"] == "association"]
+    assert "association of 'SCANNER' (127.0.0.1) to 'AUTOSPINE': accepted" in said
+    assert "MR Image Storage in Explicit VR Little Endian: accepted" in said
 
 
 def test_check_says_when_the_disk_is_low(tmp_path):
@@ -291,7 +336,7 @@ def test_it_ends_when_its_parent_is_gone_and_on_sigterm(config):
     assert listener.end() == 0
     listener = ListenerProcess(config)
     listener.process.send_signal(signal.SIGTERM)
-    assert listener.process.wait(10) == 0
+    assert listener.process.wait(60) == 0
     listener.end()
 
 
@@ -309,17 +354,23 @@ class Sender(threading.Thread):
     def run(self) -> None:
         ae = AE(f"S{self.prefix}"[:16])
         ae.add_requested_context(MR_IMAGE, [ExplicitVRLittleEndian])
-        ae.dimse_timeout = 2
         opened: list[socket.socket] = []  # pynetdicom leaves it open when the peer dies
         remember = (evt.EVT_CONN_OPEN, lambda event: opened.append(event.assoc.dul.socket.socket))
         association = ae.associate(
             "127.0.0.1", self.port, ae_title="AUTOSPINE", evt_handlers=[remember]
         )
+        self.messages = mended(association).dimse.msg_queue
         try:
             self.send_all(association)
         finally:
             for sock in opened:
                 sock.close()
+
+    def end(self) -> None:
+        """The peer is dead: end the wait for its answer, which pynetdicom would sit out."""
+        while self.is_alive():
+            self.messages.put((None, None))  # type: ignore[arg-type]
+            self.join(0.05)
 
     def send_all(self, association: Association) -> None:
         dice = random.Random(self.prefix)
@@ -343,7 +394,8 @@ def processor_s(pid: int) -> float:
     return sum(map(int, fields[11:13])) / os.sysconf("SC_CLK_TCK")
 
 
-def crash_campaign(folder: Path, kills: int) -> None:
+def crash_campaign(folder: Path, kills: int) -> float:
+    """Kill under load, at random instants; return the slowest restart, s of processor time."""
     config = write_room(folder)
     inbox = folder / "case" / "inbox"
     dice = random.Random(20)
@@ -355,13 +407,14 @@ def crash_campaign(folder: Path, kills: int) -> None:
         senders = [Sender(listener.port, f"{kill + 1}.{n + 1}") for n in range(2)]
         for sender in senders:
             sender.start()
-        time.sleep(dice.uniform(0.1, 1.0))
+        under_load = dice.randrange(10, 60)
+        wait_for(lambda s=senders, n=under_load: sum(len(x.answered) for x in s) >= n)
+        time.sleep(dice.uniform(0.0, 0.02))
         listener.kill()
         for sender in senders:
-            sender.join()
+            sender.end()
             answered |= sender.answered
     print(f"{len(answered)} answered in {kills} runs, slowest restart {slowest_restart_s:.2f} s")
-    assert len(answered) > 5 * kills
     with listening(config), CaseRecord(folder / "case") as record:
         wait_for(lambda: {row.sop_instance_uid for row in record.slices()} >= answered.keys())
         record.verify_events()
@@ -373,7 +426,7 @@ def crash_campaign(folder: Path, kills: int) -> None:
     for path in inbox.glob("*.dcm"):
         assert is_whole(path)
         assert read_envelope(path)[0].sop_instance_uid in by_uid
-    assert slowest_restart_s < 2.0
+    return slowest_restart_s
 
 
 def test_what_was_answered_success_survives_kill_9(tmp_path):
@@ -382,4 +435,4 @@ def test_what_was_answered_success_survives_kill_9(tmp_path):
 
 @pytest.mark.soak
 def test_what_was_answered_success_survives_twenty_kills(tmp_path):
-    crash_campaign(tmp_path, kills=20)
+    assert crash_campaign(tmp_path, kills=20) < 2.0

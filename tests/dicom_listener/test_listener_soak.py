@@ -12,6 +12,7 @@ from pynetdicom import AE
 
 from case_record.record import CaseRecord
 from dicom_listener.quirks import MR_IMAGE
+from dicom_listener.requestor import mended
 
 
 def resident_kib(pid: int) -> int:
@@ -30,7 +31,7 @@ def send_slices(port: int, first: int, count: int, per_association: int) -> None
     for start in range(first, first + count, per_association):
         ae = AE("SOAK")
         ae.add_requested_context(MR_IMAGE, [ExplicitVRLittleEndian])
-        association = ae.associate("127.0.0.1", port, ae_title="AUTOSPINE")
+        association = mended(ae.associate("127.0.0.1", port, ae_title="AUTOSPINE"))
         assert association.is_established
         sock = association.dul.socket.socket
         sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
@@ -46,7 +47,7 @@ def send_slices(port: int, first: int, count: int, per_association: int) -> None
 
 def bare_connections(port: int, count: int) -> None:
     for number in range(count):
-        with socket.create_connection(("127.0.0.1", port), 10) as sock:
+        with socket.create_connection(("127.0.0.1", port), 60) as sock:
             if number % 10 == 0:
                 sock.sendall(b"GET / HTTP/1.0\r\n\r\n")
 
@@ -59,13 +60,13 @@ def soak(folder: Path, warm_up: int, slices: int, connections: int) -> tuple[flo
         with CaseRecord(folder / "case") as record:
             send_slices(listener.port, 0, warm_up, 100)
             bare_connections(listener.port, connections // 10)
-            wait_for(lambda: sum(record.count_slices().values()) == warm_up, 60)
+            wait_for(lambda: sum(record.count_slices().values()) == warm_up, 600)
             time.sleep(2)
             before_kib, threads_before = resident_kib(pid), threads(pid)
             send_slices(listener.port, warm_up, slices, 100)
             bare_connections(listener.port, connections)
-            wait_for(lambda: sum(record.count_slices().values()) == warm_up + slices, 120)
-            wait_for(lambda: threads(pid) <= threads_before, 60)
+            wait_for(lambda: sum(record.count_slices().values()) == warm_up + slices, 600)
+            wait_for(lambda: threads(pid) <= threads_before)
             after_kib, threads_after = resident_kib(pid), threads(pid)
             record.verify_events()
     finally:
