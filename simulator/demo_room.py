@@ -194,6 +194,8 @@ class DemoRoom:
             "bridge": {
                 "link": str(self.virtual_dir / "line-bridge"),
                 "state_dir": str(self.virtual_dir / "bridge"),
+                # the emulated controllers share the processors with everything else
+                "controller_timeout_s": 1.0,
             },
         }
         if self.options.guide:

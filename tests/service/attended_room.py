@@ -26,8 +26,8 @@ class AttendedRoom(DemoRoom):
     tokens: it asks whoever comes for a token, the scanner too; `operator_token` is the operator's.
     """
 
-    def __init__(self, folder: Path, more: str = "", *, tokens: bool = False) -> None:
-        super().__init__(DemoOptions(folder, seed=3, speed_factor=1.5, tokens=tokens))
+    def __init__(self, folder: Path, more: str = "", **options: bool) -> None:
+        super().__init__(DemoOptions(folder, seed=3, speed_factor=1.5, **options))
         self._more = more
 
     def _write_config(self, ports: tuple[int, int]) -> Path:
@@ -61,8 +61,8 @@ class AttendedRoom(DemoRoom):
 
 
 @contextmanager
-def running_room(folder: Path, more: str = "", *, tokens: bool = False) -> Iterator[AttendedRoom]:
-    room = AttendedRoom(folder, more, tokens=tokens)
+def running_room(folder: Path, more: str = "", **options: bool) -> Iterator[AttendedRoom]:
+    room = AttendedRoom(folder, more, **options)
     try:
         room.start()
         yield room
