@@ -83,7 +83,7 @@ class DemoRoom:
         slow = [self.family.launch(n, autospine(n, *here)) for n in ("listener", "worker")]
         self.url = str(self.family.start("service", autospine("service", *here))["url"])
         for child in slow:
-            child.wait_ready(30.0)
+            child.wait_ready(120.0)
         self.family.start("scanner", autospine("scanner", *here))
 
     def check(self) -> None:
