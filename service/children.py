@@ -117,7 +117,7 @@ class Family:
         log_dir.mkdir(parents=True, exist_ok=True)
         self.children: dict[str, Child] = {}
 
-    def start(self, name: str, words: Sequence[str], timeout_s: float = 30.0) -> dict[str, Any]:
+    def start(self, name: str, words: Sequence[str], timeout_s: float = 120.0) -> dict[str, Any]:
         """Start a child and return the facts of its ready line."""
         child = self.launch(name, words)
         return child.wait_ready(timeout_s)

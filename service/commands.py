@@ -12,18 +12,18 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from case_record.record import CaseRecord
 from dicom_listener.overrule import give_up_slices, reassign, reset_clock
 from robot_bridge.client import BridgeError, BridgeStatus
 from room_config.load import Config
 from room_config.service import GuideConfig
-from service.approach import CONFIRM, ApproachArguments
-from service.calibration import Calibration, CalibrationArguments
+from service.approach import CONFIRM
+from service.calibration import Calibration
 from service.estimate import MotionNoise
 from service.execution import Execution
-from service.guide_plan import guide_approach_of, guide_calibration_of
+from service.fiducial_plan import approach_of, calibration_of, recording_of
+from service.guide_plan import guide_approach_of, guide_calibration_of, guide_recording_of
 from service.plan import PLAN_VOID, PlanRefusedError, Travel, check_travel
 from service.procedures import (
     APPROACH,
@@ -31,6 +31,7 @@ from service.procedures import (
     CALIBRATION,
     GUIDE_APPROACH,
     GUIDE_CALIBRATION,
+    GUIDE_RECORDING,
     JOG,
     RECORDING,
     approach_arguments,
@@ -40,7 +41,7 @@ from service.procedures import (
     latest_calibration,
     recording_arguments,
 )
-from service.recording import RecordingArguments
+from service.readiness import ConflictError, may_start, ready_arrival
 from service.room_link import RoomLink
 from service.start_point import POSITION_DECLARED, positions_to_declare, start_point
 from service.targets import (
@@ -52,21 +53,9 @@ from service.targets import (
     all_targets,
     current_entry,
     current_target,
-    fiducial_must_appear_at,
 )
-from sr_engine.shiftset import named, paper_random
 
 _SOURCE = "service"
-# a recorded target is to be known this much better than it must be reached
-_TARGET_SHARE = 5
-
-
-class ConflictError(Exception):
-    """Not now; the text says why and what to do. `code` is for programs."""
-
-    def __init__(self, code: str, text: str) -> None:
-        super().__init__(text)
-        self.code = code
 
 
 class Commands:
@@ -135,28 +124,10 @@ class Commands:
         with_guide = self._guide_wanted(guide)
         if with_guide is not None:
             return self._start_guide_calibration(with_guide, by)
-        service = self._config.service
-        travel = self._travel()
-        origin_um = {axis: (t.min_um + t.max_um) // 2 for axis, t in travel.items()}
-        move_um = round(service.calibration_move_mm * 1000)
-        first, second = service.axes
-        for axis in (first, second):
-            if axis not in travel:
-                raise ConflictError("unknown_axis", f"The robot has no axis {axis!r}.")
-            try:
-                check_travel({axis: origin_um[axis] + move_um}, travel)
-            except PlanRefusedError as error:
-                raise ConflictError("out_of_travel", f"Calibration: {error}.") from error
-        arguments = CalibrationArguments(
-            axes=(first, second),
-            origin_um=origin_um,
-            move_um=move_um,
-            shifts_px=self._shifts_px(),
-            position_gate_mm=self._config.imaging.position_gate_mm,
-            gate_sigma=service.prediction_gate_sigma,
-            repeatability_mm=service.repeatability_um / 1000,
-            scale_error=service.step_scale_error,
-        )
+        try:
+            arguments = calibration_of(self._config, self._travel(), self._seed())
+        except PlanRefusedError as error:
+            raise ConflictError("out_of_travel", f"Calibration: {error}.") from error
         return self._begin(CALIBRATION, calibration_arguments(arguments), by)
 
     def _guide_wanted(self, guide: bool | None) -> GuideConfig | None:
@@ -202,18 +173,17 @@ class Commands:
         self._note(TARGET_SET, by, {**body, "in_water": known.in_water, "again": number})
 
     def record_target(self, by: str, label: str = "") -> int:
-        """Begin to find out where the fiducial is now: that place becomes the target."""
+        """Begin to find out where the fiducial is now: that place becomes the target.
+
+        With two fiducials the needle's line does: entry point and target.
+        """
         self._may_start()
-        service = self._config.service
-        arguments = RecordingArguments(
-            strategy=service.strategy,
-            sigma_mm=service.tolerance_mm / _TARGET_SHARE,
-            position_gate_mm=self._config.imaging.position_gate_mm,
-            gate_sigma=service.prediction_gate_sigma,
-            repeatability_mm=service.repeatability_um / 1000,
-            scale_error=service.step_scale_error,
-            seed=self._seed(),
-        )
+        guide = self._guide_wanted(None)
+        if guide is not None:
+            start = self._start_point(guide=True)
+            told = recording_arguments(guide_recording_of(self._config, guide), start)
+            return self._begin(GUIDE_RECORDING, {**told, "label": label, "by": by}, by)
+        arguments = recording_of(self._config, self._seed())
         start = self._start_point()
         body = {**recording_arguments(arguments, start), "label": label, "by": by}
         return self._begin(RECORDING, body, by)
@@ -268,22 +238,17 @@ class Commands:
             return self._start_guide_approach(with_guide, by)
         start = self._start_point()
         target = self._target()
-        row, col = self._wanted_place(start, target).tolist()
-        service = self._config.service
-        arguments = ApproachArguments(
-            target_mm=(row, col),
-            travel_um=self._link.travel_um,
-            tolerance_mm=service.tolerance_mm,
-            confidence=service.confidence,
-            max_iterations=service.max_iterations,
-            confirm_moves=service.confirm_moves,
-            position_gate_mm=self._config.imaging.position_gate_mm,
-            gate_sigma=service.prediction_gate_sigma,
-            repeatability_mm=service.repeatability_um / 1000,
-            scale_error=service.step_scale_error,
-            strategy=service.strategy,
-            seed=self._seed(),
-        )
+        try:
+            arguments = approach_of(
+                self._config,
+                self._link.travel_um,
+                start,
+                target,
+                self._newest_header(),
+                self._seed(),
+            )
+        except TargetError as error:
+            raise _unusable(error) from error
         body = {**approach_arguments(arguments, start), "target": target.number}
         return self._begin(APPROACH, body, by)
 
@@ -310,14 +275,6 @@ class Commands:
     def _newest_header(self) -> Mapping[str, Any]:
         newest = self._record.last_slice("assigned")
         return {} if newest is None else newest.header
-
-    def _wanted_place(self, start: Calibration, target: Target) -> NDArray[np.float64]:
-        """Where the fiducial must appear in the image plane to be at the target."""
-        polarity = self._config.imaging.readout_polarity
-        try:
-            return fiducial_must_appear_at(target, start.plane, self._newest_header(), polarity)
-        except TargetError as error:
-            raise _unusable(error) from error
 
     def answer(self, question_id: str, choice: str, by: str, plan_id: str | None = None) -> None:
         """Answer the question that is on the page; void if it is another one by now.
@@ -462,12 +419,6 @@ class Commands:
         if refusal is not None:
             raise refusal
 
-    def _shifts_px(self) -> tuple[tuple[float, float], ...]:
-        name = self._config.service.shift_set
-        if name != "paper":
-            return named(name).shifts_px
-        return paper_random(np.random.default_rng(self._seed())).shifts_px
-
     def _seed(self) -> int:
         """Of the next procedure's random choices: from the case's seed and its number."""
         case = self._record.case()
@@ -490,30 +441,3 @@ class Commands:
 
 def _unusable(error: TargetError) -> ConflictError:
     return ConflictError("target_unusable", f"The target cannot be used: {error}.")
-
-
-def may_start(record: CaseRecord, status: BridgeStatus | None) -> ConflictError | None:
-    """Why the robot may not begin to move now, or None."""
-    if status is None:
-        return ConflictError("no_link", "No link to the robot.")
-    if record.running_procedure() is not None:
-        return ConflictError("busy", "A procedure is running: wait for its end or abort it.")
-    if ready_arrival(record) is not None or status.insertion_locked:
-        return ConflictError("insertion_locked", "Motion is locked until the needle is out.")
-    if status.stopped or not status.armed:
-        return ConflictError("not_armed", "Re-arm the robot first.")
-    return None
-
-
-def ready_arrival(record: CaseRecord) -> tuple[int, dict[str, Any]] | None:
-    """The approach (id and result) whose target the needle guide is at, until the needle is out."""
-    done = [record.last_procedure(name, "done") for name in APPROACHES]
-    arrival = max((row for row in done if row), key=lambda row: row.procedure_id, default=None)
-    if arrival is None or arrival.result is None or arrival.ended_s is None:
-        return None
-    if record.running_procedure() is not None:
-        return None
-    out = record.last_event("needle_out")
-    if out is not None and out.wall_s > arrival.ended_s:
-        return None
-    return arrival.procedure_id, dict(arrival.result)

@@ -20,16 +20,18 @@ import structlog
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Procedure
 from room_config.load import Config
-from service.commands import Commands, ConflictError
+from service.commands import Commands
 from service.describe import Describer
 from service.execution import Execution, ProcedureAbortedError
+from service.guide_recording import GuidePlace
 from service.procedures import build_procedure, result_to_json
+from service.readiness import ConflictError
 from service.recording import Place
 from service.room_link import RoomLink
 from service.runner import ReplayMismatchError, run_procedure
 from service.sensing import ProcedureFailedError
 from service.state import RoomState
-from service.targets import TARGET_SET
+from service.targets import ENTRY_SET, TARGET_SET
 
 _TICK_S = 0.002
 _PUBLISH_EVERY_S = 0.1
@@ -162,24 +164,30 @@ class ControlLoop:
         else:
             with record.transaction():
                 record.end_procedure(procedure_id, "done", result_to_json(result))
-                if isinstance(result, Place):
+                if isinstance(result, Place | GuidePlace):
                     self._make_target(running, result)
                 record.append_event("procedure_done", source, source="service")
         finally:
             execution.clear()
         self._publish()
 
-    def _make_target(self, recorded: Procedure, place: Place) -> None:
-        """The place that was recorded is the target from now on."""
-        found = self._record.measurement(place.calibration.measurement_id).result or {}
+    def _make_target(self, recorded: Procedure, place: Place | GuidePlace) -> None:
+        """The place that was recorded is the target from now on; a needle's line has an entry."""
+        who = recorded.arguments["by"]
+        if isinstance(place, GuidePlace):
+            entry = {"patient_mm": place.joint_mm, "procedure_id": recorded.procedure_id}
+            self._record.append_event(ENTRY_SET, entry, source="service", who=who)
+            patient_mm = place.tip_mm
+        else:
+            found = self._record.measurement(place.calibration.measurement_id).result or {}
+            patient_mm = place.patient_mm(found)
         body = {
-            "patient_mm": place.patient_mm(found),
+            "patient_mm": patient_mm,
             "label": recorded.arguments["label"],
             "in_water": False,
             "procedure_id": recorded.procedure_id,
             "sigma_mm": place.to_json()["sigma_mm"],
         }
-        who = recorded.arguments["by"]
         self._record.append_event(TARGET_SET, body, source="service", who=who)
 
     def _tick(self) -> None:

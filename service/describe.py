@@ -15,10 +15,10 @@ from robot_bridge.client import BridgeStatus
 from robot_bridge.phases import WorkPhase
 from room_config.load import Config
 from service.alarms import AlarmBook, Condition
-from service.commands import may_start, ready_arrival
 from service.estimate import probability_within
 from service.execution import Execution
 from service.procedures import CALIBRATION, GUIDE_CALIBRATION, latest_calibration
+from service.readiness import may_start, ready_arrival
 from service.room_link import RoomLink
 from service.state import (
     AcquisitionState,

@@ -92,6 +92,7 @@ class Execution:
 
     def answer(self, choice: str, who: str) -> None:
         self._answer = Answered(choice, who)
+        self.question = None  # at once: nobody sees or answers it a second time
 
     def abort(self, reason: str) -> None:
         """End the running procedure at its next look; nothing if none runs."""

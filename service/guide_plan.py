@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from room_config.load import Config
 from room_config.service import GuideConfig
 from service.calibration import Calibration
+from service.fiducial_plan import TARGET_SHARE
 from service.guide_approach import GuideApproachArguments
 from service.guide_calibration import GuideCalibrationArguments
 from service.guide_geometry import GuideGeometry
+from service.guide_recording import GuideRecordingArguments
 from service.plan import Travel, check_travel
 from service.targets import Target, TargetError, needle_line, oil_shift_mm
 
@@ -46,6 +48,20 @@ def guide_calibration_of(
         gate_sigma=config.service.prediction_gate_sigma,
         repeatability_mm=config.service.repeatability_um / 1000,
         scale_error=config.service.step_scale_error,
+    )
+
+
+def guide_recording_of(config: Config, guide: GuideConfig) -> GuideRecordingArguments:
+    """Where the guide points now, the tip judged where a target usually lies."""
+    service = config.service
+    return GuideRecordingArguments(
+        geometry=geometry_of(guide),
+        lower_plane_mm=guide.lower_plane_mm,
+        sigma_mm=guide.tolerance_mm / TARGET_SHARE,
+        position_gate_mm=config.imaging.position_gate_mm,
+        gate_sigma=service.prediction_gate_sigma,
+        repeatability_mm=service.repeatability_um / 1000,
+        scale_error=service.step_scale_error,
     )
 
 

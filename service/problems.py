@@ -18,8 +18,8 @@ from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
 from case_record.record import CaseRecordError
-from service.commands import ConflictError
 from service.images import ImageMissingError
+from service.readiness import ConflictError
 
 PROBLEM_TYPE = "application/problem+json"
 _CODES = {404: "not_found", 405: "method_not_allowed", 415: "unsupported_media_type"}

@@ -13,6 +13,7 @@ from service.calibration import Calibration, CalibrationArguments, calibrate
 from service.guide_approach import GuideApproachArguments, GuideArrival, approach_guide
 from service.guide_calibration import GuideCalibrationArguments, calibrate_guide
 from service.guide_geometry import GuideGeometry
+from service.guide_recording import GuidePlace, GuideRecordingArguments, record_guide
 from service.jog import JogEnd, jog
 from service.recording import Place, RecordingArguments, record_place
 from service.steps import ProcedureSteps
@@ -22,6 +23,7 @@ APPROACH = "approach"
 RECORDING = "recording"
 GUIDE_CALIBRATION = "guide_calibration"
 GUIDE_APPROACH = "guide_approach"
+GUIDE_RECORDING = "guide_recording"
 JOG = "jog"
 CALIBRATIONS, APPROACHES = (CALIBRATION, GUIDE_CALIBRATION), (APPROACH, GUIDE_APPROACH)
 
@@ -39,7 +41,9 @@ def approach_arguments(arguments: ApproachArguments, start: Calibration) -> dict
     return {"arguments": asdict(arguments), "start": start.to_json()}
 
 
-def recording_arguments(arguments: RecordingArguments, start: Calibration) -> dict[str, Any]:
+def recording_arguments(
+    arguments: RecordingArguments | GuideRecordingArguments, start: Calibration
+) -> dict[str, Any]:
     return {"arguments": asdict(arguments), "start": start.to_json()}
 
 
@@ -54,7 +58,7 @@ def guide_approach_arguments(
 
 
 def result_to_json(
-    result: Calibration | Arrival | GuideArrival | Place | JogEnd,
+    result: Calibration | Arrival | GuideArrival | Place | GuidePlace | JogEnd,
 ) -> dict[str, Any]:
     return result.to_json()
 
@@ -68,7 +72,7 @@ def latest_calibration(record: CaseRecord, *, guide: bool = False) -> Calibratio
     if calibration is None or calibration.result is None:
         return None
     newest = calibration
-    for name in (GUIDE_APPROACH,) if guide else (APPROACH, RECORDING):
+    for name in (GUIDE_APPROACH, GUIDE_RECORDING) if guide else (APPROACH, RECORDING):
         row = record.last_procedure(name, "done")
         if row is not None and row.result is not None and row.procedure_id > newest.procedure_id:
             newest = row
@@ -118,11 +122,17 @@ def _build_guide_approach(value: Mapping[str, Any]) -> ProcedureSteps[GuideArriv
     return approach_guide(GuideApproachArguments(**fields), Calibration.from_json(value["start"]))
 
 
+def _build_guide_recording(value: Mapping[str, Any]) -> ProcedureSteps[GuidePlace]:
+    fields = {**value["arguments"], "geometry": _guide_geometry(value["arguments"]["geometry"])}
+    return record_guide(GuideRecordingArguments(**fields), Calibration.from_json(value["start"]))
+
+
 _BUILDERS: dict[str, Callable[[Mapping[str, Any]], ProcedureSteps[Any]]] = {
     CALIBRATION: _build_calibration,
     APPROACH: _build_approach,
     RECORDING: _build_recording,
     GUIDE_CALIBRATION: _build_guide_calibration,
     GUIDE_APPROACH: _build_guide_approach,
+    GUIDE_RECORDING: _build_guide_recording,
     JOG: lambda value: jog(value["setpoints_um"]),
 }

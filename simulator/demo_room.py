@@ -83,7 +83,7 @@ class DemoRoom:
         slow = [self.family.launch(n, autospine(n, *here)) for n in ("listener", "worker")]
         self.url = str(self.family.start("service", autospine("service", *here))["url"])
         for child in slow:
-            child.wait_ready(30.0)
+            child.wait_ready(120.0)
         self.family.start("scanner", autospine("scanner", *here))
 
     def check(self) -> None:
@@ -194,6 +194,8 @@ class DemoRoom:
             "bridge": {
                 "link": str(self.virtual_dir / "line-bridge"),
                 "state_dir": str(self.virtual_dir / "bridge"),
+                # the emulated controllers share the processors with everything else
+                "controller_timeout_s": 1.0,
             },
         }
         if self.options.guide:

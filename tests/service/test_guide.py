@@ -18,6 +18,7 @@ from service.guide_geometry import (
     state_on_line,
     tip_of,
 )
+from service.guide_recording import GuideRecordingArguments, record_guide
 from service.procedures import (
     GUIDE_APPROACH,
     GUIDE_CALIBRATION,
@@ -26,6 +27,7 @@ from service.procedures import (
 )
 from service.replay import replay_measurements, replay_procedure
 from service.sensing import ProcedureFailedError
+from service.targets import needle_line
 from simulator.config import Fiducial, VirtualRoom
 from simulator.mr_slice import slice_geometry
 from simulator.scene import true_fiducials_mm
@@ -283,6 +285,23 @@ def test_a_recorded_case_of_four_axes_replays_to_the_last_bit(tmp_path):
         again = list(replay_measurements(record, None))
     assert len(again) == 2 * 6 + arrival_measurements(arrival)
     assert all(row.difference_mm == 0.0 for row in again)
+
+
+def test_a_recorded_line_is_where_the_guide_truly_points_as_well_as_it_says():
+    misses = []
+    for seed in range(12):
+        room = make_room(seed)
+        calibration = room.run(calibrate_guide(calibration_arguments()))
+        recording = GuideRecordingArguments(GEOMETRY, LOWER_PLANE, 0.05, **GATES)
+        place = room.run(record_guide(recording, calibration))
+        assert place.sigma_mm < 0.05
+        assert place.tip_below_joint_mm == BELOW
+        assert place.frames >= 2
+        miss = (np.array(place.tip_mm) - true_guide(room).at(-BELOW))[[0, 2]]
+        misses.append(float(np.linalg.norm(miss)) / place.sigma_mm)
+        needle = needle_line(place.joint_mm, place.tip_mm, PLANE, LOWER_PLANE, LOWER_PLANE + APART)
+        assert needle.state(GEOMETRY, PLANE) == pytest.approx(place.calibration.estimate.plane_mm)
+    assert 0.6 < np.sqrt(np.mean(np.square(misses)) / 2) < 1.6  # of 24 normal numbers
 
 
 def arrival_measurements(arrival):

@@ -50,11 +50,11 @@ def test_the_page_stays_up_until_ctrl_c_and_then_all_ends(demo):
     url = next(
         line.split("page: ")[1].strip() for line in running.process.stderr if "page: " in line
     )
-    with urllib.request.urlopen(url, timeout=5) as page:
+    with urllib.request.urlopen(url, timeout=60) as page:
         assert b"AutoSPINe" in page.read()
     running.look()
     running.process.send_signal(signal.SIGINT)
-    ended = running.ended(30.0)
+    ended = running.ended()
     assert ended.code == 0, ended.err
     assert "Traceback" not in ended.err
     running.assert_nothing_left()
@@ -75,7 +75,7 @@ def test_a_killed_process_ends_in_a_stopped_robot_and_the_case_goes_on(demo, vic
     running = demo("--exit", "--punctures", "1", "--seed", "5")
     running.wait_for_event("move_sent")
     os.kill(running.pid_of(PROCESSES[victim]), signal.SIGKILL)
-    ended = running.ended(30.0)
+    ended = running.ended()
     assert ended.code == 3
     assert f"{victim} was killed by SIGKILL" in ended.err
     assert "still moved" not in ended.err
@@ -103,14 +103,14 @@ def test_a_port_in_use_is_named(demo):
         taken.listen()
         port = taken.getsockname()[1]
         running = demo("--exit", "--page-port", str(port))
-        ended = running.ended(30.0)
+        ended = running.ended()
     assert ended.code == 2
     assert f"{port}" in ended.err
     assert "Traceback" not in ended.err
 
 
 def test_an_unknown_fault_is_named_with_those_that_exist(demo):
-    ended = demo("--exit", "--fault", "earthquake").ended(30.0)
+    ended = demo("--exit", "--fault", "earthquake").ended()
     assert ended.code == 2
     assert "earthquake" in ended.err
     assert "late" in ended.err
@@ -120,7 +120,7 @@ def test_an_unknown_fault_is_named_with_those_that_exist(demo):
 @pytest.mark.parametrize("seed", range(10))
 def test_three_punctures_for_ten_seeds(demo, seed):
     running = demo("--exit", "--punctures", "3", "--seed", str(seed))
-    ended = running.ended(120.0)
+    ended = running.ended()
     assert ended.code == 0, ended.err
     assert_good(ended.results(), 3)
 
@@ -129,7 +129,7 @@ def test_three_punctures_for_ten_seeds(demo, seed):
 @pytest.mark.parametrize("fault", known_faults())
 def test_a_fault_of_the_scanner_costs_slices_but_no_accuracy(demo, fault):
     running = demo("--exit", "--punctures", "1", "--seed", "2", "--fault", fault)
-    ended = running.ended(170.0)
+    ended = running.ended()
     assert ended.code in (0, 3), ended.err
     if ended.code == 0:
         assert_good(ended.results(), 1)

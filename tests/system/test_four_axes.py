@@ -2,11 +2,12 @@
 
 import json
 import subprocess
+import sys
 import tomllib
+from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import AUTOSPINE
 from scipy.stats import chi2
 
 from case_record.record import CaseRecord
@@ -14,6 +15,7 @@ from service.procedures import GUIDE_APPROACH, GUIDE_CALIBRATION
 from simulator.config import parse_virtual_room
 from simulator.scene import true_guide
 
+AUTOSPINE = Path(sys.executable).parent / "autospine"
 LOWER_PLANE_MM, TARGET_DEPTH_MM = -2.0, 80.0
 PUNCTURES = 3
 IN_PLANE = [0, 2]  # of patient x, y, z in coronal slices; the image's rows run against z

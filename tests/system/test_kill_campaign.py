@@ -10,6 +10,7 @@ import signal
 import threading
 import time
 import tomllib
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
@@ -56,13 +57,28 @@ class MotionWatch:
                     self._seen[(motion.axis, motion.start_s)] = motion
 
 
-def kill_at_random(demo, case_dir, dice, punctures, reach_s) -> str | None:
+@dataclass(frozen=True)
+class Plan:
+    """Which case is disturbed, and how: `kills` at most, each within `reach_s` of the start."""
+
+    kills: int
+    punctures: int
+    reach_s: float
+    words: tuple[str, ...] = ()
+    largest_error_mm: float = 0.10
+
+    @property
+    def demo_words(self) -> list[str]:
+        return ["--exit", "--punctures", str(self.punctures), "--seed", "5", *self.words]
+
+
+def kill_at_random(demo, case_dir, dice, plan) -> str | None:
     """Run the demo and kill one of its processes; None if it was done before."""
-    running = demo("--exit", "--punctures", str(punctures), "--seed", "5", case_dir=case_dir)
+    running = demo(*plan.demo_words, case_dir=case_dir)
     victim = dice.choice([*VICTIMS, DEMO])
     pid = running.process.pid if victim == DEMO else running.pid_of(VICTIMS[victim], 300.0)
     running.pid_of(VICTIMS["scanner"], 300.0)  # the last one to be started
-    deadline_s = time.monotonic() + dice.uniform(0.0, reach_s)
+    deadline_s = time.monotonic() + dice.uniform(0.0, plan.reach_s)
     while time.monotonic() < deadline_s and running.process.poll() is None:
         running.look()
         time.sleep(0.02)
@@ -83,23 +99,23 @@ def note(case_dir: Path, text: str) -> None:
         log.write(f"{time.strftime('%H:%M:%S')} {case_dir.name} {text}\n")
 
 
-def campaign(demo, case_dir, seed, kills, punctures, reach_s) -> list[str]:
+def campaign(demo, case_dir, seed, plan) -> list[str]:
     """Kill, restart, kill again; then let the case come to its end. Return who was killed."""
     dice = random.Random(seed)
     victims = []
     with MotionWatch(case_dir) as motions:
-        for _ in range(kills):
-            victim = kill_at_random(demo, case_dir, dice, punctures, reach_s)
+        for _ in range(plan.kills):
+            victim = kill_at_random(demo, case_dir, dice, plan)
             if victim is None:
                 break
             victims.append(victim)
-        last = demo("--exit", "--punctures", str(punctures), "--seed", "5", case_dir=case_dir)
+        last = demo(*plan.demo_words, case_dir=case_dir)
         ended = last.ended(600.0)
     note(case_dir, f"went on to its end: exit {ended.code}")
     assert ended.code == 0, f"after {victims}: {ended.err[-1500:]}"
     results = ended.results()
-    assert len(results["punctures"]) == punctures
-    assert all(one["true_error_mm"] <= 0.10 for one in results["punctures"])
+    assert len(results["punctures"]) == plan.punctures
+    assert all(one["true_error_mm"] <= plan.largest_error_mm for one in results["punctures"])
     assert results["unintended_motions"] == 0
     with CaseRecord(case_dir) as record:
         assert record.verify_events() > 20
@@ -109,7 +125,7 @@ def campaign(demo, case_dir, seed, kills, punctures, reach_s) -> list[str]:
 
 
 def test_a_case_goes_on_after_random_kills(demo, tmp_path):
-    assert campaign(demo, tmp_path / "case", seed=1, kills=1, punctures=1, reach_s=6.0)
+    assert campaign(demo, tmp_path / "case", 1, Plan(kills=1, punctures=1, reach_s=6.0))
 
 
 @pytest.mark.soak
@@ -118,7 +134,18 @@ def test_soak_fifty_kills_over_ten_cases(demo, tmp_path):
     killed: list[str] = []
     number = 0
     while len(killed) < 50:
-        case_dir = tmp_path / f"case-{number}"
-        killed += campaign(demo, case_dir, 100 + number, kills=5, punctures=4, reach_s=10.0)
+        plan = Plan(kills=5, punctures=4, reach_s=10.0)
+        killed += campaign(demo, tmp_path / f"case-{number}", 100 + number, plan)
         number += 1
     assert len(set(killed)) >= 5
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(0)
+def test_soak_cases_of_four_axes_go_on_after_random_kills(demo, tmp_path):
+    killed: list[str] = []
+    number = 0
+    while len(killed) < 10:
+        plan = Plan(5, 2, 15.0, ("--guide",), largest_error_mm=0.4)
+        killed += campaign(demo, tmp_path / f"case-{number}", 200 + number, plan)
+        number += 1
