@@ -22,19 +22,26 @@ class CaseRecordError(Exception):
 
 
 class Connection:
-    """What every part of the record stands on. Use it in the thread that opened it."""
+    """What every part of the record stands on. Use it in the thread that opened it.
 
-    def __init__(self, case_dir: Path, *, create: bool = False) -> None:
+    read_only: nothing is written, not even a migration; a record of another schema is refused.
+    """
+
+    def __init__(self, case_dir: Path, *, create: bool = False, read_only: bool = False) -> None:
         self.case_dir = Path(case_dir)
         path = self.case_dir / FILE_NAME
         if create:
             self.case_dir.mkdir(parents=True, exist_ok=True)
         elif not path.is_file():
             raise CaseRecordError(f"{self.case_dir}: no case record ({FILE_NAME}) in this folder")
-        self._db = sqlite3.connect(path, timeout=_BUSY_TIMEOUT_S, isolation_level=None)
+        where = _read_only_uri(path) if read_only else path.absolute().as_uri()
+        self._db = sqlite3.connect(where, timeout=_BUSY_TIMEOUT_S, isolation_level=None, uri=True)
         self._db.row_factory = sqlite3.Row
         try:
-            self._prepare()
+            if read_only:
+                self._check_schema()
+            else:
+                self._prepare()
         except sqlite3.DatabaseError as error:
             self._db.close()
             raise CaseRecordError(f"{path}: not a usable case record ({error})") from error
@@ -60,6 +67,14 @@ class Connection:
                 for statement in _statements(MIGRATIONS[number]):
                     self._db.execute(statement)
                 self._db.execute(f"PRAGMA user_version = {number + 1}")
+
+    def _check_schema(self) -> None:
+        version = self._db.execute("PRAGMA user_version").fetchone()[0]
+        if version != SCHEMA_VERSION:
+            raise CaseRecordError(
+                f"{self.case_dir}: the case record has schema version {version}, this program "
+                f"reads {SCHEMA_VERSION}; it was left untouched"
+            )
 
     def close(self) -> None:
         self._db.close()
@@ -93,6 +108,12 @@ class Connection:
     def change_count(self) -> tuple[int, int]:
         """As `data_version`, and a number that also changes with what this connection wrote."""
         return self.data_version(), self._db.total_changes
+
+
+def _read_only_uri(path: Path) -> str:
+    """Without a write-ahead log nobody has the record open: it can be read without leaving one."""
+    is_open = path.with_name(path.name + "-wal").exists()
+    return f"{path.absolute().as_uri()}?mode=ro{'' if is_open else '&immutable=1'}"
 
 
 def _statements(script: str) -> Iterator[str]:

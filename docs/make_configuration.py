@@ -9,7 +9,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from room_config.load import Config
-from room_config.service import AccessToken
+from room_config.service import AccessToken, GuideConfig
 from simulator.config import VirtualRoom
 
 HERE = Path(__file__).parent
@@ -58,6 +58,12 @@ the table by itself. Travel limits have no default on purpose.
 | axis `home_mm` | none | Where the reference lies. |
 """
 
+GUIDE_TEXT = (
+    "A robot with two stages and a fiducial in each of two slices: needle line and tip are steered, "
+    "with four axes, to an entry and a target point. Positions are along the slice normal (patient y "
+    "of coronal slices), distances along the guide from the lower ball joint."
+)
+
 
 def render() -> str:
     """Return the whole page."""
@@ -65,6 +71,7 @@ def render() -> str:
     for name, field in Config.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
             parts.append(f"\n## `[{name}]`\n\n{_table(field.annotation)}")
+    parts.append(f"\n## `[service.guide]`\n\n{GUIDE_TEXT}\n\n{_table(GuideConfig)}")
     parts.append(f"\n## `[[service.token]]`\n\n{_table(AccessToken)}")
     parts.append(_BRIDGE)
     parts.append(

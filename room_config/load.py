@@ -11,7 +11,7 @@ import os
 import tomllib
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
@@ -22,6 +22,7 @@ from room_config.service import ServiceConfig
 from room_config.worker import WorkerConfig
 
 ENVIRONMENT_PREFIX = "AUTOSPINE_"
+Model = TypeVar("Model", bound=BaseModel)
 
 
 class ConfigError(Exception):
@@ -45,15 +46,27 @@ class Config(BaseModel):
 
 
 def load_config(path: Path, environment: Mapping[str, str] = os.environ) -> Config:
-    """Return the checked configuration in `path`; relative folders are relative to that file."""
+    """Return the checked configuration in `path`; relative paths are relative to that file."""
     table = read_toml(path)
     _override(table, environment)
     try:
         config = Config.model_validate(table)
     except ValidationError as error:
         raise ConfigError(f"{path}: {_first_error(error)}") from None
-    case_dir = (path.parent / config.room.case_dir).resolve()
-    return config.model_copy(update={"room": config.room.model_copy(update={"case_dir": case_dir})})
+    sections = {name: getattr(config, name) for name in ("room", "listener", "service")}
+    return config.model_copy(
+        update={name: _absolute(section, path.parent) for name, section in sections.items()}
+    )
+
+
+def _absolute(section: Model, folder: Path) -> Model:
+    """The section with every path in it taken from the folder of its file, not from this one."""
+    paths = {
+        name: (folder / value).resolve()
+        for name in type(section).model_fields
+        if isinstance(value := getattr(section, name), Path)
+    }
+    return section.model_copy(update=paths)
 
 
 def read_toml(path: Path) -> dict[str, Any]:

@@ -34,6 +34,70 @@ class AccessToken(Section):
         return datetime.fromtimestamp(wall_s, UTC).date() > self.expires
 
 
+class GuideConfig(Section):
+    """A robot with two stages and two fiducials on the guide: four degrees of freedom.
+
+    Positions are along the slice normal (patient y of coronal slices), distances along the guide.
+    """
+
+    axes: list[str] = Field(
+        default=["xt", "yt", "xb", "yb"],
+        min_length=4,
+        max_length=4,
+        description="The top stage's two axes, then the bottom stage's two.",
+    )
+    upper_plane_mm: float = Field(
+        description="Where the plane of the upper ball joint crosses the slice normal."
+    )
+    lower_plane_mm: float = Field(
+        description="Where the plane of the lower ball joint, in which the cannula is fixed, "
+        "crosses the slice normal."
+    )
+    upper_fiducial_mm: float = Field(
+        gt=0,
+        description="Distance of the upper fiducial along the guide from the lower ball joint.",
+    )
+    lower_fiducial_mm: float = Field(
+        gt=0,
+        description="Distance of the lower fiducial along the guide from the lower ball joint.",
+    )
+    upper_slice_mm: float = Field(
+        description="Position along its normal of the slice that shows the upper fiducial."
+    )
+    lower_slice_mm: float = Field(
+        description="Position along its normal of the slice that shows the lower fiducial."
+    )
+    needle_reach_mm: float = Field(
+        default=120.0,
+        gt=0,
+        description="A target further below the lower ball joint than this is refused.",
+    )
+    calibration_move_mm: float = Field(
+        default=6.0, description="Length of the four calibration moves; the sign is the direction."
+    )
+    tolerance_mm: float = Field(
+        default=0.25, gt=0, description="READY when the error of the needle's tip is below this."
+    )
+
+    @model_validator(mode="after")
+    def _fits_together(self) -> "GuideConfig":
+        if len(set(self.axes)) != len(self.axes):
+            raise ValueError("axes: four different ones are needed")
+        if self.upper_plane_mm == self.lower_plane_mm:
+            raise ValueError("upper_plane_mm and lower_plane_mm must differ")
+        if not self.upper_fiducial_mm > self.lower_fiducial_mm:
+            raise ValueError("upper_fiducial_mm must be above lower_fiducial_mm")
+        if self.upper_slice_mm == self.lower_slice_mm:
+            raise ValueError("upper_slice_mm and lower_slice_mm must differ")
+        upwards = self.upper_plane_mm > self.lower_plane_mm
+        if (self.upper_slice_mm > self.lower_slice_mm) != upwards:
+            raise ValueError(
+                "upper_slice_mm must lie from lower_slice_mm to the side on which upper_plane_mm "
+                "lies from lower_plane_mm"
+            )
+        return self
+
+
 class ServiceConfig(Section):
     host: str = Field(default="127.0.0.1", description="Address of the page and the API.")
     port: int = Field(default=8080, ge=0, le=65535, description="0: any free port.")
@@ -101,6 +165,12 @@ class ServiceConfig(Section):
         gt=0,
         lt=1,
         description="Relative scatter of a move's length from one move to the next.",
+    )
+
+    guide: GuideConfig | None = Field(
+        default=None,
+        description="The [service.guide] table of a robot with two stages; absent: one stage, one "
+        "fiducial.",
     )
 
     @model_validator(mode="after")

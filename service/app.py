@@ -31,7 +31,9 @@ from service.problems import Problem, add_problems, problem, responses
 from service.room_link import PumpedClient, RoomLink
 from service.routes_access import access_router
 from service.routes_command import clerk_router, command_router, stop_router
-from service.routes_record import image_router, live_router, record_router
+from service.routes_documents import document_router
+from service.routes_images import measurement_image_router, slice_image_router
+from service.routes_record import live_router, record_router
 
 PAGE = Path(__file__).parent / "page"
 _HOUR_S = 3600.0
@@ -75,7 +77,9 @@ def create_app(config: Config, announce: Callable[[], None] = lambda: None) -> F
         stop_router(loop),
         live_router(loop, broadcast),
         record_router(case_dir),
-        image_router(case_dir),
+        slice_image_router(case_dir),
+        measurement_image_router(case_dir),
+        document_router(case_dir),
         command_router(loop),
         clerk_router(loop),
         access_router(access, uses_tls=uses_tls),

@@ -25,7 +25,7 @@ CONFIRM = "confirm"
 REJECT = "reject"
 _MOST_FRAMES = 6
 _WORTH_MORE_FRAMES = 0.6
-_LOOSE_MM = 0.25
+LOOSE_MM = 0.25
 PROBABILITY, PAPER = "probability", "paper"
 
 
@@ -118,7 +118,11 @@ def approach(arguments: ApproachArguments, start: Calibration) -> ProcedureSteps
         if standing.iterations == arguments.max_iterations:
             raise _not_converged(arguments, standing)
         plan = _plan(arguments, standing)
-        yield from _confirm(arguments, plan)
+        if arguments.confirm_moves:
+            row, col = plan.displacement_mm
+            yield from ask_to_confirm(
+                f"Move the fiducial by ({row:+.3f}, {col:+.3f}) mm (row, col)?", plan
+            )
         standing = yield from _go(arguments, standing, plan, way)
 
 
@@ -221,7 +225,7 @@ def _go(
 def _is_loose(arguments: ApproachArguments, estimate: FiducialEstimate) -> bool:
     """True if the start is known so badly that a plan from it would be a guess."""
     worst_mm = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance_mm2)[-1]))
-    return worst_mm > max(_LOOSE_MM, arguments.tolerance_mm)
+    return worst_mm > max(LOOSE_MM, arguments.tolerance_mm)
 
 
 def _is_there(arguments: ApproachArguments, standing: _Standing, way: Way) -> bool:
@@ -257,11 +261,8 @@ def _plan(arguments: ApproachArguments, standing: _Standing) -> Plan:
         raise ProcedureFailedError("target_out_of_reach", str(error)) from error
 
 
-def _confirm(arguments: ApproachArguments, plan: Plan) -> ProcedureSteps[None]:
-    if not arguments.confirm_moves:
-        return
-    row, col = plan.displacement_mm
-    question = f"Move the fiducial by ({row:+.3f}, {col:+.3f}) mm (row, col)?"
+def ask_to_confirm(question: str, plan: Plan) -> ProcedureSteps[None]:
+    """Wait for the operator; raises ProcedureFailedError unless the plan is confirmed."""
     answer = yield from ask(AskOperator(question, (CONFIRM, REJECT), plan.to_json()), Answered)
     if answer.choice != CONFIRM:
         raise ProcedureFailedError("rejected", f"the move was rejected by {answer.who}")

@@ -26,6 +26,22 @@ class PointBody(Ask):
     patient_mm: PointMm = Field(examples=[[12.0, -40.0, 7.5]])
 
 
+class ProcedureBody(Ask):
+    """Which degrees of freedom are driven."""
+
+    guide: bool | None = Field(
+        default=None,
+        description="True: both fiducials and four axes; false: one fiducial and two axes; null: "
+        "as the room is configured.",
+    )
+
+
+class TargetHereBody(Ask):
+    """The place where the fiducial is now."""
+
+    label: str = Field(default="", max_length=80)
+
+
 class TargetBody(PointBody):
     """Where the fiducial is to be."""
 
@@ -110,6 +126,19 @@ class SessionBody(BaseModel):
     role: Literal["viewer", "operator"]
     csrf: str
     needs_token: bool
+
+
+class KnownTarget(BaseModel):
+    """A target of the case; `number` is that of the event by which it was set."""
+
+    number: int
+    patient_mm: PointMm
+    label: str
+    in_water: bool
+    current: bool
+    set_s: float
+    who: str
+    approaches: list[int]
 
 
 class EventBody(BaseModel):

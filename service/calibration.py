@@ -7,9 +7,9 @@ be checked against a prediction.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Protocol, TypeVar
 
 import numpy as np
 
@@ -74,31 +74,98 @@ class Calibration:
         )
 
 
+class Seen(Protocol):
+    """What one look of a calibration gives, of one fiducial or of two."""
+
+    @property
+    def measurement_id(self) -> int: ...
+
+    @property
+    def plane(self) -> ImagePlane: ...
+
+    def at(self, setpoints_um: Mapping[str, int]) -> FiducialEstimate: ...
+
+
+@dataclass(frozen=True, eq=False)
+class OneSeen:
+    """One fiducial at one hold."""
+
+    measured: Measured
+
+    @property
+    def measurement_id(self) -> int:
+        return self.measured.measurement_id
+
+    @property
+    def plane(self) -> ImagePlane:
+        return ImagePlane.from_json(self.measured.plane)
+
+    def at(self, setpoints_um: Mapping[str, int]) -> FiducialEstimate:
+        return estimate_from(self.measured, setpoints_um)
+
+
+SeenThere = TypeVar("SeenThere", bound=Seen)
+# of the place before and, where there is one, of the prediction for this place
+LookThere = Callable[[FiducialEstimate | None, FiducialEstimate | None], ProcedureSteps[SeenThere]]
+
+
 def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
     """Run the calibration; raises ProcedureFailedError when the moves do not explain the images."""
-    places = _places(arguments)
-    jacobian = ImageJacobian.unknown(arguments.axes)
-    noise = arguments.noise
+
+    def look(
+        before: FiducialEstimate | None, predicted: FiducialEstimate | None
+    ) -> ProcedureSteps[OneSeen]:
+        expectation = _expectation(before, predicted, arguments)
+        return OneSeen((yield from measure_here(arguments.method, expectation))[1])
+
+    found = yield from drive_and_learn(
+        _places(arguments),
+        ImageJacobian.unknown(arguments.axes),
+        arguments.noise,
+        _ASYMMETRY_CHECK_SIGMA,
+        look,
+        _check,
+    )
+    return (yield from _refine(found, arguments))
+
+
+def drive_and_learn(
+    places: Sequence[Mapping[str, int]],
+    jacobian: ImageJacobian,
+    noise: MotionNoise,
+    gate_sigma: float,
+    look: LookThere[SeenThere],
+    check: Callable[[ImageJacobian], None],
+) -> ProcedureSteps[Calibration]:
+    """Drive to each place, look, and learn from each move; the last one is predicted.
+
+    The last place is the way back: `check` must be content before it is driven, and what is seen
+    there must be what was predicted (within `gate_sigma`).
+    """
     before: FiducialEstimate | None = None
     plane: ImagePlane | None = None
     for number, setpoints_um in enumerate(places):
-        if number == len(places) - 1:
-            _check(jacobian)
-        moved = yield from move(MoveTo(setpoints_um, f"calibration {number + 1}/{len(places)}"))
-        expectation = _expectation(before, moved.readback_um, jacobian, arguments, number)
-        _, measured = yield from measure_here(arguments.method, expectation)
-        plane = _checked_plane(plane, measured)
-        here = estimate_from(measured, moved.readback_um)
+        last = number == len(places) - 1
+        if last:
+            check(jacobian)
+        moved = yield from move(
+            MoveTo(dict(setpoints_um), f"calibration {number + 1}/{len(places)}")
+        )
+        predicted = None
+        if last and before is not None:
+            predicted = before.moved_to(moved.readback_um, jacobian, noise)
+        seen = yield from look(before, predicted)
+        plane = _checked_plane(plane, seen.plane)
+        here = seen.at(moved.readback_um)
+        if predicted is not None:
+            check_prediction(predicted, here, gate_sigma, noise)
         if before is not None:
-            if number == len(places) - 1:
-                predicted = before.moved_to(moved.readback_um, jacobian, noise)
-                check_prediction(predicted, here, _ASYMMETRY_CHECK_SIGMA, noise)
             jacobian = learn_from_move(jacobian, before, here, noise)
         before = here
     assert before is not None
     assert plane is not None
-    _check(jacobian)
-    return (yield from _refine(before, jacobian, plane, measured, arguments))
+    check(jacobian)
+    return Calibration(jacobian, before, plane, seen.measurement_id)
 
 
 def _check(jacobian: ImageJacobian) -> None:
@@ -134,22 +201,18 @@ def _places(arguments: CalibrationArguments) -> list[dict[str, int]]:
 
 def _expectation(
     before: FiducialEstimate | None,
-    setpoints_um: Mapping[str, int],
-    jacobian: ImageJacobian,
+    predicted: FiducialEstimate | None,
     arguments: CalibrationArguments,
-    number: int,
 ) -> Expectation | None:
     if before is None:
         return None
-    if number == len(_places(arguments)) - 1:
-        predicted = before.moved_to(setpoints_um, jacobian, arguments.noise)
+    if predicted is not None:
         return Expectation.of(predicted, arguments.position_gate_mm, arguments.gate_sigma)
     # which way the axis points in the image is not known yet: anywhere around the last place
     return Expectation(before.plane_mm, abs(arguments.move_um) / 1000 * 1.3)
 
 
-def _checked_plane(plane: ImagePlane | None, measured: Measured) -> ImagePlane:
-    this = ImagePlane.from_json(measured.plane)
+def _checked_plane(plane: ImagePlane | None, this: ImagePlane) -> ImagePlane:
     if plane is not None and not this.is_parallel_to(plane):
         raise ProcedureFailedError(
             "plane_changed", "the slice orientation changed during the procedure: rescan as before"
@@ -157,26 +220,19 @@ def _checked_plane(plane: ImagePlane | None, measured: Measured) -> ImagePlane:
     return plane or this
 
 
-def _refine(
-    estimate: FiducialEstimate,
-    jacobian: ImageJacobian,
-    plane: ImagePlane,
-    last: Measured,
-    arguments: CalibrationArguments,
-) -> ProcedureSteps[Calibration]:
+def _refine(found: Calibration, arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
     """Measure once more with the commanded shifts around the origin, if any are wanted."""
-    measurement_id = last.measurement_id
-    if len(arguments.shifts_px) > 1:
-        expectation = Expectation.of(estimate, arguments.position_gate_mm, arguments.gate_sigma)
-        found = yield from measure_shift_set(
-            estimate,
-            arguments.shifts_px,
-            jacobian,
-            plane,
-            arguments.method,
-            expectation,
-            arguments.noise,
-        )
-        # all that was known before has been through the same moves: nothing to add
-        estimate, measurement_id = found.estimate, found.measured.measurement_id
-    return Calibration(jacobian, estimate, plane, measurement_id)
+    if len(arguments.shifts_px) < 2:
+        return found
+    expectation = Expectation.of(found.estimate, arguments.position_gate_mm, arguments.gate_sigma)
+    shifted = yield from measure_shift_set(
+        found.estimate,
+        arguments.shifts_px,
+        found.jacobian,
+        found.plane,
+        arguments.method,
+        expectation,
+        arguments.noise,
+    )
+    # all that was known before has been through the same moves: nothing to add
+    return replace(found, estimate=shifted.estimate, measurement_id=shifted.measured.measurement_id)

@@ -12,16 +12,26 @@ import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from types import TracebackType
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 import httpx
-from pydantic import BaseModel, TypeAdapter
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from service.bodies import EventBody, MeasurementBody, SessionBody, SliceBody, Started
+from service.bodies import (
+    CaseSummary,
+    EventBody,
+    Health,
+    KnownTarget,
+    MeasurementBody,
+    SessionBody,
+    SliceBody,
+    Started,
+)
 from service.state import RoomState
 
 _TIMEOUT_S = 35.0
 _STOP_TIMEOUT_S = 2.0
+_LONG_TIMEOUT_S = 600.0
 _SILENT_S = 5.0
 Model = TypeVar("Model", bound=BaseModel)
 
@@ -86,13 +96,57 @@ class RoomClient:
         return self._list("/api/v1/events", EventBody, after=after, limit=limit)
 
     def slices(
-        self, after: int = 0, limit: int = 1000, state: str | None = None
+        self,
+        after: int = 0,
+        limit: int = 1000,
+        state: Literal["assigned", "pending", "quarantined"] | None = None,
+        *,
+        newest: bool = False,
     ) -> list[SliceBody]:
+        """One page of slices; `newest`: backwards from the newest (or from before `after`)."""
         wanted = {} if state is None else {"state": state}
-        return self._list("/api/v1/slices", SliceBody, after=after, limit=limit, **wanted)
+        page = {"after": after, "limit": limit, "newest": newest}
+        return self._list("/api/v1/slices", SliceBody, **page, **wanted)
+
+    def slice(self, slice_id: int) -> SliceBody:
+        return self._get(f"/api/v1/slices/{slice_id}", SliceBody)
 
     def measurements(self, after: int = 0, limit: int = 1000) -> list[MeasurementBody]:
         return self._list("/api/v1/measurements", MeasurementBody, after=after, limit=limit)
+
+    def cases(self) -> list[CaseSummary]:
+        """The case folders beside the present one, newest first."""
+        return self._list("/api/v1/cases", CaseSummary)
+
+    def health(self) -> Health:
+        """Every part of the room; also where the service itself says that it is not well."""
+        try:
+            answer = self._http.get("/healthz")
+            return Health.model_validate_json(answer.text)
+        except httpx.TransportError as error:
+            raise self._gone(error) from error
+        except ValidationError:
+            raise _refusal(answer) from None
+
+    def metric(self, name: str) -> float:
+        """One of the counters of /metrics that has no labels; KeyError if there is none."""
+        for line in self._ask("GET", "/metrics").text.splitlines():
+            said, _, value = line.partition(" ")
+            if said == name:
+                return float(value)
+        raise KeyError(name)
+
+    def report(self, case: str | None = None) -> str:
+        """The report of a case (by the name of its folder; None: the present one) as HTML."""
+        return self._ask("GET", "/api/v1/report", **_of_case(case)).text
+
+    def export(self, case: str | None = None) -> bytes:
+        """A case as one zip of DICOM, JSON lines and images."""
+        return self._ask("GET", "/api/v1/export", **_of_case(case)).content
+
+    def measurement_png(self, measurement_id: int, scale: int = 1) -> bytes:
+        path = f"/api/v1/measurements/{measurement_id}/image.png"
+        return self._ask("GET", path, params={"scale": scale}).content
 
     def slice_png(self, slice_id: int, scale: int = 1) -> bytes:
         path = f"/api/v1/slices/{slice_id}/image.png"
@@ -126,11 +180,12 @@ class RoomClient:
         self._ask("POST", "/api/v1/stop", json=body, timeout=_STOP_TIMEOUT_S)
 
     def reset(self) -> None:
-        """Clear a latched stop, take the positions as they stand, and arm."""
+        """Clear a latched stop, take the positions as they stand or are recorded, and arm."""
         self._order("POST", "/api/v1/reset")
 
-    def start_calibration(self) -> int:
-        return self._start("/api/v1/calibration")
+    def start_calibration(self, *, guide: bool | None = None) -> int:
+        """guide: with both fiducials and four axes; None: as the room is configured."""
+        return self._start("/api/v1/calibration", guide=guide)
 
     def set_target(
         self, patient_mm: Sequence[float], *, label: str = "", in_water: bool = False
@@ -140,13 +195,26 @@ class RoomClient:
         self._order("PUT", "/api/v1/target", **fields)
 
     def withdraw_target(self) -> None:
-        self._order("DELETE", "/api/v1/target")
+        """There is no target any more until another one is set."""
+        self._order("POST", "/api/v1/target/withdraw")
+
+    def record_target(self, label: str = "") -> int:
+        """The place where the fiducial is now becomes the target."""
+        return self._start("/api/v1/target/here", label=label)
+
+    def targets(self) -> list[KnownTarget]:
+        """Every target of the case."""
+        return self._list("/api/v1/targets", KnownTarget)
+
+    def choose_target(self, number: int) -> None:
+        self._order("POST", f"/api/v1/targets/{number}/choose")
 
     def set_entry(self, patient_mm: Sequence[float]) -> None:
         self._order("PUT", "/api/v1/entry", patient_mm=list(patient_mm))
 
-    def start_approach(self) -> int:
-        return self._start("/api/v1/approach")
+    def start_approach(self, *, guide: bool | None = None) -> int:
+        """guide: to the line from entry to target; None: as the room is configured."""
+        return self._start("/api/v1/approach", guide=guide)
 
     def jog(self, axis: str, distance_um: int) -> int:
         return self._start("/api/v1/jog", axis=axis, distance_um=distance_um)
@@ -182,6 +250,10 @@ class RoomClient:
 
     def describe_case(self, label: str, operator: str = "", note: str = "") -> None:
         self._order("PUT", "/api/v1/case", label=label, operator=operator, note=note)
+
+    def confirm_acquisition(self, hold_id: int) -> None:
+        """The slices of a hold were acquired (rooms in arrival mode)."""
+        self._order("POST", "/api/v1/acquisition", hold_id=hold_id)
 
     def assign_slice(self, slice_id: int, hold_id: int | None, why: str = "") -> None:
         path = f"/api/v1/slices/{slice_id}/assignment"
@@ -219,6 +291,11 @@ class RoomClient:
 
     def _gone(self, error: httpx.TransportError) -> ServiceGoneError:
         return ServiceGoneError(f"{self.url}: {str(error) or type(error).__name__}")
+
+
+def _of_case(case: str | None) -> dict[str, Any]:
+    params = {} if case is None else {"case": case}
+    return {"params": params, "timeout": _LONG_TIMEOUT_S}
 
 
 def _refusal(answer: httpx.Response) -> RefusedByServiceError:

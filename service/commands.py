@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -19,32 +18,47 @@ from case_record.record import CaseRecord
 from dicom_listener.overrule import give_up_slices, reassign, reset_clock
 from robot_bridge.client import BridgeError, BridgeStatus
 from room_config.load import Config
+from room_config.service import GuideConfig
 from service.approach import CONFIRM, ApproachArguments
 from service.calibration import Calibration, CalibrationArguments
 from service.estimate import MotionNoise
 from service.execution import Execution
-from service.plan import PlanRefusedError, Travel, check_travel
+from service.guide_plan import guide_approach_of, guide_calibration_of
+from service.plan import PLAN_VOID, PlanRefusedError, Travel, check_travel
 from service.procedures import (
     APPROACH,
+    APPROACHES,
     CALIBRATION,
+    GUIDE_APPROACH,
+    GUIDE_CALIBRATION,
     JOG,
+    RECORDING,
     approach_arguments,
     calibration_arguments,
+    guide_approach_arguments,
+    guide_calibration_arguments,
     latest_calibration,
+    recording_arguments,
 )
+from service.recording import RecordingArguments
 from service.room_link import RoomLink
+from service.start_point import POSITION_DECLARED, positions_to_declare, start_point
 from service.targets import (
+    ENTRY_SET,
     TARGET_SET,
     TARGET_WITHDRAWN,
+    Target,
     TargetError,
+    all_targets,
+    current_entry,
     current_target,
     fiducial_must_appear_at,
 )
 from sr_engine.shiftset import named, paper_random
 
 _SOURCE = "service"
-# what a restart of the robot may have moved it by, per axis, before it is seen again
-_UNSEEN_MOVE_MM = 5.0
+# a recorded target is to be known this much better than it must be reached
+_TARGET_SHARE = 5
 
 
 class ConflictError(Exception):
@@ -67,12 +81,15 @@ class Commands:
     # Robot
 
     def reset(self, by: str) -> None:
-        """Clear a latched stop, take the positions as they stand, and arm."""
+        """Clear a latched stop, take the positions as they stand or are recorded, and arm."""
         status = self._linked()
         try:
             if not status.position_certain:
-                self._link.client.declare_position(status.positions_um, by)
-                self._note("position_declared", by, {"positions_um": dict(status.positions_um)})
+                positions_um = positions_to_declare(self._record, status.positions_um)
+                self._link.client.declare_position(positions_um, by)
+                counted_um = dict(status.positions_um)
+                body = {"positions_um": positions_um, "counted_um": counted_um}
+                self._note(POSITION_DECLARED, by, body)
             if status.stopped:
                 self._link.client.rearm(by)
             elif not status.armed:
@@ -112,9 +129,12 @@ class Commands:
 
     # Procedures
 
-    def start_calibration(self, by: str) -> int:
-        """Begin a calibration; returns its procedure id."""
+    def start_calibration(self, by: str, guide: bool | None = None) -> int:
+        """Begin a calibration; returns its procedure id. guide: four axes; None: as configured."""
         self._may_start()
+        with_guide = self._guide_wanted(guide)
+        if with_guide is not None:
+            return self._start_guide_calibration(with_guide, by)
         service = self._config.service
         travel = self._travel()
         origin_um = {axis: (t.min_um + t.max_um) // 2 for axis, t in travel.items()}
@@ -139,30 +159,86 @@ class Commands:
         )
         return self._begin(CALIBRATION, calibration_arguments(arguments), by)
 
+    def _guide_wanted(self, guide: bool | None) -> GuideConfig | None:
+        """The guide's table if four axes are to be used; None for one fiducial and two axes."""
+        configured = self._config.service.guide
+        if guide and configured is None:
+            raise ConflictError(
+                "no_guide", "This room has no [service.guide] table: it steers two axes only."
+            )
+        return configured if guide or guide is None else None
+
+    def _start_guide_calibration(self, guide: GuideConfig, by: str) -> int:
+        try:
+            arguments = guide_calibration_of(self._config, guide, self._travel())
+        except PlanRefusedError as error:
+            raise ConflictError("out_of_travel", f"Calibration: {error}.") from error
+        return self._begin(GUIDE_CALIBRATION, guide_calibration_arguments(arguments), by)
+
     def set_target(
         self, patient_mm: Sequence[float], by: str, label: str = "", in_water: bool = False
     ) -> None:
         """Set where the fiducial is to be, in patient mm (LPS); in_water: a place in tissue."""
         if len(patient_mm) != 3 or not all(math.isfinite(value) for value in patient_mm):
             raise ConflictError("bad_target", "A target is three finite numbers, patient mm.")
-        self._may_change_target()
+        self._void_plan_for(by, "target was changed")
         body = {"patient_mm": [float(value) for value in patient_mm]}
         self._note(TARGET_SET, by, {**body, "label": label, "in_water": in_water})
 
     def withdraw_target(self, by: str) -> None:
         """There is no target any more until another one is set."""
-        self._may_change_target()
         if current_target(self._record) is None:
             raise ConflictError("no_target", "There is no target to withdraw.")
+        self._void_plan_for(by, "target was withdrawn")
         self._note(TARGET_WITHDRAWN, by, {})
 
-    def _may_change_target(self) -> None:
-        if self._record.running_procedure() is not None:
-            raise ConflictError("busy", "Abort the running procedure before changing the target.")
+    def choose_target(self, number: int, by: str) -> None:
+        """Take a target of this case again, by its number."""
+        known = next((t for t in all_targets(self._record) if t.number == number), None)
+        if known is None:
+            raise ConflictError("no_target", f"This case has no target number {number}.")
+        self._void_plan_for(by, "target was changed")
+        body = {"patient_mm": list(known.patient_mm), "label": known.label}
+        self._note(TARGET_SET, by, {**body, "in_water": known.in_water, "again": number})
+
+    def record_target(self, by: str, label: str = "") -> int:
+        """Begin to find out where the fiducial is now: that place becomes the target."""
+        self._may_start()
+        service = self._config.service
+        arguments = RecordingArguments(
+            strategy=service.strategy,
+            sigma_mm=service.tolerance_mm / _TARGET_SHARE,
+            position_gate_mm=self._config.imaging.position_gate_mm,
+            gate_sigma=service.prediction_gate_sigma,
+            repeatability_mm=service.repeatability_um / 1000,
+            scale_error=service.step_scale_error,
+            seed=self._seed(),
+        )
+        start = self._start_point()
+        body = {**recording_arguments(arguments, start), "label": label, "by": by}
+        return self._begin(RECORDING, body, by)
 
     def set_entry(self, patient_mm: Sequence[float], by: str) -> None:
         """Set the planned skin point, patient mm (LPS)."""
-        self._note("entry_set", by, {"patient_mm": [float(value) for value in patient_mm]})
+        if self._config.service.guide is not None:
+            self._void_plan_for(by, "entry point was changed")
+        self._note(ENTRY_SET, by, {"patient_mm": [float(value) for value in patient_mm]})
+
+    def _void_plan_for(self, by: str, what: str) -> None:
+        """Before a target changes: void the plan that waits for confirmation; refuse if busy."""
+        running = self._record.running_procedure()
+        if running is None:
+            return
+        question = self._execution.question
+        if running.name not in APPROACHES or question is None or question.plan is None:
+            raise ConflictError("busy", "Abort the running procedure before changing the target.")
+        reason = (
+            f"the {what} by {by} while a move waited for confirmation: the move is not made, "
+            "start the approach again"
+        )
+        body = {"plan_id": question.plan["plan_id"], "reason": reason}
+        self._note("plan_void", by, body)
+        self._abort(reason)
 
     def jog(self, axis: str, distance_um: int, by: str) -> int:
         """Move one axis by hand; returns the id of the procedure that does it."""
@@ -181,11 +257,18 @@ class Commands:
         setpoints_um = {**status.positions_um, axis: setpoint_um}
         return self._begin(JOG, {"setpoints_um": setpoints_um}, by)
 
-    def start_approach(self, by: str) -> int:
-        """Begin the approach to the target; returns its procedure id."""
+    def start_approach(self, by: str, guide: bool | None = None) -> int:
+        """Begin the approach to the target; returns its procedure id.
+
+        guide: with four axes, to the line from entry to target; None: as configured.
+        """
         self._may_start()
+        with_guide = self._guide_wanted(guide)
+        if with_guide is not None:
+            return self._start_guide_approach(with_guide, by)
         start = self._start_point()
-        row, col = self._wanted_place(start).tolist()
+        target = self._target()
+        row, col = self._wanted_place(start, target).tolist()
         service = self._config.service
         arguments = ApproachArguments(
             target_mm=(row, col),
@@ -201,23 +284,40 @@ class Commands:
             strategy=service.strategy,
             seed=self._seed(),
         )
-        return self._begin(APPROACH, approach_arguments(arguments, start), by)
+        body = {**approach_arguments(arguments, start), "target": target.number}
+        return self._begin(APPROACH, body, by)
 
-    def _wanted_place(self, start: Calibration) -> NDArray[np.float64]:
-        """Where the fiducial must appear in the image plane to be at the target."""
+    def _start_guide_approach(self, guide: GuideConfig, by: str) -> int:
+        start = self._start_point(guide=True)
+        target, entry_mm = self._target(), current_entry(self._record)
+        if entry_mm is None:
+            raise ConflictError("no_entry", "Set an entry point first: the needle has a direction.")
+        try:
+            arguments = guide_approach_of(
+                self._config, guide, self._travel(), start, entry_mm, target, self._newest_header()
+            )
+        except TargetError as error:
+            raise _unusable(error) from error
+        body = {**guide_approach_arguments(arguments, start), "target": target.number}
+        return self._begin(GUIDE_APPROACH, body, by)
+
+    def _target(self) -> Target:
         target = current_target(self._record)
         if target is None:
             raise ConflictError("no_target", "Set a target first.")
+        return target
+
+    def _newest_header(self) -> Mapping[str, Any]:
         newest = self._record.last_slice("assigned")
-        header = {} if newest is None else newest.header
+        return {} if newest is None else newest.header
+
+    def _wanted_place(self, start: Calibration, target: Target) -> NDArray[np.float64]:
+        """Where the fiducial must appear in the image plane to be at the target."""
+        polarity = self._config.imaging.readout_polarity
         try:
-            return fiducial_must_appear_at(
-                target, start.plane, header, self._config.imaging.readout_polarity
-            )
+            return fiducial_must_appear_at(target, start.plane, self._newest_header(), polarity)
         except TargetError as error:
-            raise ConflictError(
-                "target_unusable", f"The target cannot be used: {error}."
-            ) from error
+            raise _unusable(error) from error
 
     def answer(self, question_id: str, choice: str, by: str, plan_id: str | None = None) -> None:
         """Answer the question that is on the page; void if it is another one by now.
@@ -226,8 +326,10 @@ class Commands:
         measurement.
         """
         question = self._execution.question
+        if self._execution.aborting is not None:
+            raise ConflictError(PLAN_VOID, f"Void: {self._execution.aborting}.")
         if question is None or question.question_id != question_id:
-            raise ConflictError("stale_question", "This question is not open any more.")
+            raise ConflictError("stale_question", self._why_closed())
         if choice not in question.choices:
             raise ConflictError("unknown_choice", f"Choose one of {', '.join(question.choices)}.")
         if choice == CONFIRM and question.plan is not None:
@@ -235,6 +337,14 @@ class Commands:
         body = {"question_id": question_id, "choice": choice}
         self._note("answered", by, body if plan_id is None else {**body, "plan_id": plan_id})
         self._execution.answer(choice, by)
+
+    def _why_closed(self) -> str:
+        text = "This question is not open any more."
+        ended = self._record.last_ended_procedure()
+        if self._record.running_procedure() is not None or ended is None:
+            return text
+        reason = (ended.result or {}).get("reason")
+        return f"{text} The {ended.name} {ended.state}: {reason}." if reason else text
 
     def _check_plan(self, plan: Mapping[str, Any], plan_id: str | None) -> None:
         status = self._linked()
@@ -367,22 +477,19 @@ class Commands:
     def _travel(self) -> dict[str, Travel]:
         return {axis: Travel(low, high) for axis, (low, high) in self._link.travel_um.items()}
 
-    def _start_point(self) -> Calibration:
+    def _start_point(self, *, guide: bool = False) -> Calibration:
         """The calibration with the estimate carried to where the robot stands now."""
-        calibration = latest_calibration(self._record)
+        calibration = latest_calibration(self._record, guide=guide)
         if calibration is None:
             raise ConflictError("not_calibrated", "Calibrate first.")
         status = self._linked()
-        estimate = calibration.estimate
-        if dict(estimate.setpoints_um) == dict(status.positions_um):
-            return calibration
         service = self._config.service
         noise = MotionNoise(service.repeatability_um / 1000, service.step_scale_error)
-        moved = estimate.moved_to(dict(status.positions_um), calibration.jacobian, noise)
-        unseen = np.eye(2) * _UNSEEN_MOVE_MM**2
-        return replace(
-            calibration, estimate=replace(moved, covariance_mm2=moved.covariance_mm2 + unseen)
-        )
+        return start_point(self._record, calibration, status.positions_um, noise)
+
+
+def _unusable(error: TargetError) -> ConflictError:
+    return ConflictError("target_unusable", f"The target cannot be used: {error}.")
 
 
 def may_start(record: CaseRecord, status: BridgeStatus | None) -> ConflictError | None:
@@ -400,7 +507,8 @@ def may_start(record: CaseRecord, status: BridgeStatus | None) -> ConflictError 
 
 def ready_arrival(record: CaseRecord) -> tuple[int, dict[str, Any]] | None:
     """The approach (id and result) whose target the needle guide is at, until the needle is out."""
-    arrival = record.last_procedure(APPROACH, "done")
+    done = [record.last_procedure(name, "done") for name in APPROACHES]
+    arrival = max((row for row in done if row), key=lambda row: row.procedure_id, default=None)
     if arrival is None or arrival.result is None or arrival.ended_s is None:
         return None
     if record.running_procedure() is not None:

@@ -18,17 +18,20 @@ from typing import Any
 import structlog
 
 from case_record.record import CaseRecord, CaseRecordError
+from case_record.rows import Procedure
 from room_config.load import Config
 from service.commands import Commands, ConflictError
 from service.describe import Describer
 from service.execution import Execution, ProcedureAbortedError
 from service.procedures import build_procedure, result_to_json
+from service.recording import Place
 from service.room_link import RoomLink
 from service.runner import ReplayMismatchError, run_procedure
 from service.sensing import ProcedureFailedError
 from service.state import RoomState
+from service.targets import TARGET_SET
 
-_TICK_S = 0.005
+_TICK_S = 0.002
 _PUBLISH_EVERY_S = 0.1
 _LEAST_BETWEEN_STATES_S = 0.02
 _PATIENCE_S = 30.0
@@ -159,19 +162,35 @@ class ControlLoop:
         else:
             with record.transaction():
                 record.end_procedure(procedure_id, "done", result_to_json(result))
+                if isinstance(result, Place):
+                    self._make_target(running, result)
                 record.append_event("procedure_done", source, source="service")
         finally:
             execution.clear()
         self._publish()
 
+    def _make_target(self, recorded: Procedure, place: Place) -> None:
+        """The place that was recorded is the target from now on."""
+        found = self._record.measurement(place.calibration.measurement_id).result or {}
+        body = {
+            "patient_mm": place.patient_mm(found),
+            "label": recorded.arguments["label"],
+            "in_water": False,
+            "procedure_id": recorded.procedure_id,
+            "sigma_mm": place.to_json()["sigma_mm"],
+        }
+        who = recorded.arguments["by"]
+        self._record.append_event(TARGET_SET, body, source="service", who=who)
+
     def _tick(self) -> None:
         """Serve the bridge and the queue once; called in every wait of every step."""
         if self._closing.is_set():
             raise _Closing
-        self._link.pump(_TICK_S)
         self._answer_queue()
         if self._publish_if_due() and self._commands is not None:
             self._commands.keep_lock()
+        # last: what the waiting step looks at next is fresh, and screens do not delay a decision
+        self._link.pump(_TICK_S)
 
     def _while_moving(self) -> None:
         """Called by the link again and again while it waits for the end of a motion."""

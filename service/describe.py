@@ -12,18 +12,21 @@ from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
 from robot_bridge.client import BridgeStatus
+from robot_bridge.phases import WorkPhase
 from room_config.load import Config
 from service.alarms import AlarmBook, Condition
 from service.commands import may_start, ready_arrival
 from service.estimate import probability_within
 from service.execution import Execution
-from service.procedures import latest_calibration
+from service.procedures import CALIBRATION, GUIDE_CALIBRATION, latest_calibration
 from service.room_link import RoomLink
 from service.state import (
     AcquisitionState,
     ArrivalState,
     CaseState,
+    ClockState,
     ErrorState,
+    FiducialState,
     HoldState,
     MeasurementState,
     ProcessState,
@@ -33,12 +36,14 @@ from service.state import (
     RoomState,
     SliceState,
 )
-from service.targets import current_target
+from service.targets import current_entry, current_target
 from sr_engine.geometry import SliceGeometry
 
 PROCESSES = ("listener", "worker")
 _BEAT_IS_OLD_S = 3.0
 _LOOK_EVERY_S = 0.25
+_LOOKED_BACK = 24
+_SAME_SLICE_MM = 0.5
 
 
 class Describer:
@@ -51,6 +56,7 @@ class Describer:
         self._alarms = AlarmBook()
         self._processes: list[ProcessState] = []
         self._look_at_s = 0.0
+        self._around_id = 0
 
     def describe(self, execution: Execution, before: RoomState) -> RoomState:
         """Return the present state; the revision grows only if something else than time changed."""
@@ -61,7 +67,6 @@ class Describer:
         last = record.last_slice()
         shown = record.last_slice("assigned") or last
         target = current_target(record)
-        entry = record.last_event("entry_set")
         target_mm = list(target.patient_mm) if target else None
         arrival = ready_arrival(record)
         measurement = record.last_measurement()
@@ -78,7 +83,7 @@ class Describer:
                 "last_outcome": ""
                 if ended is None
                 else _outcome_text(ended.name, ended.state, ended.result),
-                "prompt": _prompt(record, link, execution, arrival is not None),
+                "prompt": _prompt(config, record, link, execution, arrival is not None),
                 "ready": arrival is not None,
                 "arrival": None if arrival is None else _arrival(*arrival),
                 "punctured": arrival is not None and _punctured(record, arrival[0]),
@@ -98,10 +103,11 @@ class Describer:
                 "slices": slices,
                 "slice": None if shown is None else _slice(shown),
                 "measurement": None if measurement is None else _measurement(measurement),
-                "reconstruction": _reconstruction(record, before.reconstruction, measurement),
-                "calibrated": record.last_procedure("calibration", "done") is not None,
+                **self._around(measurement, before),
+                "clock": _clock(config, record),
+                "calibrated": _is_calibrated(config, record),
                 "target_patient_mm": tuple(target_mm) if target_mm else None,
-                "entry_patient_mm": tuple(entry.body["patient_mm"]) if entry else None,
+                "entry_patient_mm": current_entry(record),
                 "error": _error(config, record, target_mm),
                 "event_id": record.last_event_id(),
                 "processes": processes,
@@ -111,6 +117,16 @@ class Describer:
         state = state.model_copy(update={"alarms": alarms})
         same = state.model_copy(update={"at_s": before.at_s}) == before
         return state.model_copy(update={"revision": before.revision + (not same)})
+
+    def _around(self, last: Measurement | None, before: RoomState) -> dict[str, Any]:
+        """What goes with the newest measurement; looked up once for each."""
+        if last is None or last.measurement_id == self._around_id:
+            return {}
+        self._around_id = last.measurement_id
+        return {
+            "reconstruction": _reconstruction(self._record, before.reconstruction, last),
+            "other_fiducial": _other_fiducial(self._record, last),
+        }
 
     def _look_at_processes(self) -> list[ProcessState]:
         if time.monotonic() >= self._look_at_s:
@@ -153,6 +169,12 @@ def _robot(link: RoomLink, before: RobotState) -> RobotState:
     )
 
 
+def _is_calibrated(config: Config, record: CaseRecord) -> bool:
+    """As the room is used: with the guide's four axes if it has them."""
+    name = CALIBRATION if config.service.guide is None else GUIDE_CALIBRATION
+    return record.last_procedure(name, "done") is not None
+
+
 def _case(record: CaseRecord) -> CaseState | None:
     described = record.last_event("case_described")
     return CaseState(**described.body) if described else None
@@ -180,13 +202,48 @@ def _slice(row: SliceRow) -> SliceState | None:
 
 
 def _arrival(procedure_id: int, result: dict[str, Any]) -> ArrivalState:
-    names = set(ArrivalState.model_fields) - {"procedure_id"}
-    return ArrivalState(procedure_id=procedure_id, **{name: result[name] for name in names})
+    known = {name: result[name] for name in ArrivalState.model_fields if name in result}
+    return ArrivalState(procedure_id=procedure_id, **known)
 
 
 def _punctured(record: CaseRecord, procedure_id: int) -> bool:
     puncture = record.last_event("puncture")
     return puncture is not None and puncture.body["procedure_id"] == procedure_id
+
+
+def _clock(config: Config, record: CaseRecord) -> ClockState | None:
+    compared = record.last_event("clock_sync")
+    listener = config.listener
+    if compared is not None:
+        offset_s, uncertainty_s = (compared.body[k] for k in ("offset_s", "uncertainty_s"))
+        return ClockState(
+            offset_s=offset_s,
+            uncertainty_s=uncertainty_s,
+            compared_s=compared.wall_s,
+            who=compared.who,
+        )
+    if listener.clock_offset_s is None:
+        return None
+    return ClockState(offset_s=listener.clock_offset_s, uncertainty_s=listener.clock_uncertainty_s)
+
+
+def _other_fiducial(record: CaseRecord, last: Measurement) -> FiducialState | None:
+    """The newest one found at another slice position than the newest measurement's."""
+    at_mm = last.request.get("slice_position_mm")
+    if at_mm is None:
+        return None
+    before = record.page_of_measurements(
+        after_id=last.measurement_id, limit=_LOOKED_BACK, newest=True
+    )
+    for row in before:
+        other_mm = row.request.get("slice_position_mm")
+        if row.result and other_mm is not None and abs(other_mm - at_mm) > _SAME_SLICE_MM:
+            return FiducialState(
+                measurement_id=row.measurement_id,
+                patient_mm=row.result["patient_mm"],
+                radius_mm=_radius_mm(row.result),
+            )
+    return None
 
 
 def _measurement(last: Measurement) -> MeasurementState:
@@ -211,14 +268,22 @@ def _measurement(last: Measurement) -> MeasurementState:
 
 
 def _reconstruction(
-    record: CaseRecord, before: ReconstructionState | None, last: Measurement | None
+    record: CaseRecord, before: ReconstructionState | None, last: Measurement
 ) -> ReconstructionState | None:
-    """The newest measurement's, if it has one; else the one that was shown."""
-    if last is None or not (last.result or {}).get("reconstruction"):
-        return before
-    if before is not None and before.measurement_id == last.measurement_id:
-        return before
-    return reconstruction_state(record, last)
+    """The newest measurement's, if it has one; else the one that was shown, or at a new start of
+    the service the newest of the last ones.
+    """
+    rows = [last]
+    if before is None:
+        rows += record.page_of_measurements(
+            after_id=last.measurement_id, limit=_LOOKED_BACK, newest=True
+        )
+    newest = next(filter(_has_reconstruction, rows), None)
+    return before if newest is None else reconstruction_state(record, newest)
+
+
+def _has_reconstruction(measurement: Measurement) -> bool:
+    return bool((measurement.result or {}).get("reconstruction"))
 
 
 def reconstruction_state(record: CaseRecord, measurement: Measurement) -> ReconstructionState:
@@ -268,24 +333,34 @@ def _error(config: Config, record: CaseRecord, target_mm: list[float] | None) ->
     )
 
 
-def _prompt(record: CaseRecord, link: RoomLink, execution: Execution, ready: bool) -> str:
+def _prompt(
+    config: Config, record: CaseRecord, link: RoomLink, execution: Execution, ready: bool
+) -> str:
     if link.status is None:
         return f"No link to the robot: {link.problem}"
-    return execution.prompt or _idle_prompt(record, link.status, ready)
+    return execution.prompt or _idle_prompt(config, record, link.status, ready)
 
 
-def _idle_prompt(record: CaseRecord, status: BridgeStatus, ready: bool) -> str:
+def _idle_prompt(config: Config, record: CaseRecord, status: BridgeStatus, ready: bool) -> str:
     if ready:
         return "READY: puncture; then say when the needle is out."
+    if status.phase is WorkPhase.EMERGENCY:
+        return "EMERGENCY: the drives are parked. See to patient and needle; then re-arm."
     if status.stopped:
-        return f"Stopped ({status.stop_reason}). Re-arm to go on."
+        return f"Stopped ({_plain(status.stop_reason)}). Re-arm to go on."
     if not status.armed:
         return "Arm the robot."
-    if record.last_procedure("calibration", "done") is None:
+    if not _is_calibrated(config, record):
         return "Start the calibration."
     if current_target(record) is None:
         return "Set a target."
+    if config.service.guide is not None and current_entry(record) is None:
+        return "Set an entry point."
     return "Start the approach, or set another target."
+
+
+def _plain(code: str) -> str:
+    return code.replace("_", " ")
 
 
 def _outcome_text(name: str, state: str, result: Any) -> str:
@@ -305,8 +380,12 @@ def _conditions(state: RoomState) -> list[Condition]:
         )
     if robot.linked and robot.fault:
         found.append(Condition("fault", "alarm", f"Motor fault: {robot.fault}", "See the motors."))
-    if robot.linked and robot.stopped:
-        text = f"The robot is stopped ({robot.stop_reason})"
+    if robot.linked and robot.phase == WorkPhase.EMERGENCY:
+        text = f"EMERGENCY ({_plain(robot.stop_reason)}): the drives are parked"
+        what = "See to patient and needle. Re-arm when it is safe, then measure again."
+        found.append(Condition("emergency", "alarm", text, what))
+    elif robot.linked and robot.stopped:
+        text = f"The robot is stopped ({_plain(robot.stop_reason)})"
         found.append(Condition("stopped", "alarm", text, "Re-arm when it is safe."))
     if robot.linked and not robot.position_certain:
         text = "The robot's position is not certain"

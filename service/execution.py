@@ -97,6 +97,11 @@ class Execution:
         """End the running procedure at its next look; nothing if none runs."""
         self._abort = reason
 
+    @property
+    def aborting(self) -> str | None:
+        """Why the running procedure is about to end, if it is."""
+        return self._abort
+
     def clear(self) -> None:
         self._answer = self._abort = self.request = self.question = None
         self.prompt = ""
@@ -212,13 +217,14 @@ class Execution:
 
     def _acquire(self, step: Acquire) -> Acquired:
         hold = self._hold_to_image(fresh=step.fresh)
-        self._record.expect_slices(hold.hold_id, step.count)
+        self._expect(hold, step)
         self._let_clocks_agree(hold)
         attempt = 0
         while True:
             missing = step.count - self._assigned(hold, step.slice_position_mm)
             if missing <= 0:
                 break
+            self._expect(hold, step)
             where = "" if step.slice_position_mm is None else f"@{step.slice_position_mm:.1f}"
             self.request = AcquisitionRequest(
                 f"{hold.hold_id}.{step.count}{where}.{attempt}",
@@ -233,6 +239,11 @@ class Execution:
             attempt += 1
         self.request = None
         return Acquired(hold.hold_id, step.count)
+
+    def _expect(self, hold: Hold, step: Acquire) -> None:
+        """Tell the listener how many slices the hold has in all: those elsewhere come on top."""
+        elsewhere = self._assigned(hold, None) - self._assigned(hold, step.slice_position_mm)
+        self._record.expect_slices(hold.hold_id, step.count + elsewhere)
 
     def _let_clocks_agree(self, hold: Hold) -> None:
         """Ask for slices only when the hold is older than the scanner's clock is uncertain."""

@@ -1,8 +1,8 @@
 """Server-sent events: the state whenever it changes, each new event of the record, a beat a second.
 
-One task watches the control loop and encodes once; the viewers only pass bytes on, so that many of
-them cost little. `id:` is the record's event id; a client that comes back with Last-Event-ID gets
-every event since, and the present state.
+One thread watches the control loop and encodes once; the viewers only pass bytes on and have no
+timers of their own, so that many of them cost little. `id:` is the record's event id; a client that
+comes back with Last-Event-ID gets every event since, and the present state.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ class Broadcast:
         self._thread = threading.Thread(target=self._watch, name="broadcast", daemon=True)
         self._server: asyncio.AbstractEventLoop | None = None
         self._state_message = b""
+        self._beat_message = b""
+        self._told_s = 0.0
         self._events: deque[tuple[int, bytes]] = deque(maxlen=_KEPT_EVENTS)
         self._newest_id = 0
         self._turn = asyncio.Event()
@@ -61,12 +63,14 @@ class Broadcast:
                 self._watch_record()
             except CaseRecordError as error:
                 structlog.get_logger().error("event stream", error=str(error))
+                self._beat_if_due()
                 self._closing.wait(_AGAIN_S)
 
     def _watch_record(self) -> None:
         while not self._loop.state.case_uid:
             if self._closing.wait(_WATCH_S):
                 return
+            self._beat_if_due()
         with CaseRecord(self._case_dir) as record:
             if not self._newest_id:
                 self._newest_id = max(0, record.last_event_id() - _KEPT_EVENTS)
@@ -74,6 +78,7 @@ class Broadcast:
             while not self._closing.wait(_WATCH_S):
                 state = self._loop.state
                 if state.revision == revision:
+                    self._beat_if_due()
                     continue
                 revision = state.revision
                 events = record.events(self._newest_id) if state.event_id > self._newest_id else []
@@ -83,15 +88,27 @@ class Broadcast:
                 self._tell(_state_message(state.model_dump_json()), messages)
                 self._closing.wait(_LEAST_BETWEEN_STATES_S)
 
-    def _tell(self, state_message: bytes, messages: list[tuple[int, bytes]]) -> None:
+    def _beat_if_due(self) -> None:
+        """Tells how old the state is: a control loop that hangs is noticed on every screen."""
+        if time.monotonic() - self._told_s < _BEAT_S:
+            return
+        body = json.dumps({"at_s": self._loop.state.at_s, "now_s": time.time()})
+        self._tell(None, [], f"event: beat\ndata: {body}\n\n".encode())
+
+    def _tell(
+        self, state: bytes | None, messages: list[tuple[int, bytes]], beat: bytes = b""
+    ) -> None:
         assert self._server is not None
+        self._told_s = time.monotonic()
         with contextlib.suppress(RuntimeError):  # the server's loop has ended
-            self._server.call_soon_threadsafe(self._publish, state_message, messages)
+            self._server.call_soon_threadsafe(self._publish, state, messages, beat)
 
     # In the server's event loop
 
-    def _publish(self, state_message: bytes, messages: list[tuple[int, bytes]]) -> None:
-        self._state_message = state_message
+    def _publish(self, state: bytes | None, messages: list[tuple[int, bytes]], beat: bytes) -> None:
+        if state is not None:
+            self._state_message = state
+        self._beat_message = beat
         self._events.extend(messages)
         turn, self._turn = self._turn, asyncio.Event()
         turn.set()
@@ -102,26 +119,25 @@ class Broadcast:
         try:
             text, after_id = await asyncio.to_thread(self._missed, after_id)
             yield b"retry: 500\n\n" + text + _state_message(self._loop.state.model_dump_json())
-            shown = self._state_message
+            shown, beaten = self._state_message, self._beat_message
             while True:
                 turn = self._turn
-                text, after_id = self._kept_since(after_id)
+                if self._events and after_id + 1 < self._events[0][0]:  # a viewer that dawdles
+                    text, after_id = await asyncio.to_thread(self._missed, after_id)
+                else:
+                    text, after_id = self._kept_since(after_id)
                 if shown is not self._state_message:
                     shown = self._state_message
                     text += shown
+                if beaten is not self._beat_message:
+                    beaten = self._beat_message
+                    text += beaten
                 if text:
                     yield text
-                try:
-                    await asyncio.wait_for(turn.wait(), _BEAT_S)
-                except TimeoutError:
-                    yield self._beat()
+                # the turn was taken before the text: what comes in between is not waited for
+                await turn.wait()
         finally:
             self.viewers -= 1
-
-    def _beat(self) -> bytes:
-        """Tells how old the state is: a control loop that hangs is noticed on every screen."""
-        body = json.dumps({"at_s": self._loop.state.at_s, "now_s": time.time()})
-        return f"event: beat\ndata: {body}\n\n".encode()
 
     def _kept_since(self, after_id: int) -> tuple[bytes, int]:
         if not self._events or self._events[-1][0] <= after_id:

@@ -10,18 +10,20 @@ import numpy as np
 
 from case_record.record import FILE_NAME, CaseRecord, CaseRecordError
 from case_record.rows import Measurement
-from service.bodies import CaseSummary, MeasurementBody
+from service.bodies import CaseSummary, KnownTarget, MeasurementBody
 from service.plane import ImagePlane
+from service.procedures import APPROACHES
+from service.targets import TARGET_SET, TARGET_WITHDRAWN, current_target, target_of
 
 _MOST_CASES = 200
 
 
 @dataclass(frozen=True)
 class Targets:
-    """Since when which target (patient mm) was set, oldest first."""
+    """Since when which target (patient mm) was set, oldest first; None: it was withdrawn."""
 
     since_s: tuple[float, ...]
-    patient_mm: tuple[tuple[float, float, float], ...]
+    patient_mm: tuple[tuple[float, float, float] | None, ...]
 
     def at(self, instant_s: float) -> tuple[float, float, float] | None:
         place = bisect_right(self.since_s, instant_s)
@@ -48,6 +50,8 @@ class Targets:
         )
 
     def _error_mm(self, row: Measurement) -> float | None:
+        if row.request.get("slice_position_mm") is not None:
+            return None  # one of two fiducials: the target is the needle's, not this one's
         target = self.at(row.requested_s)
         if target is None or not row.result:
             return None
@@ -59,21 +63,59 @@ def _sigma_mm(covariance_mm2: list[list[float]]) -> float:
     return float(np.sqrt(np.trace(np.array(covariance_mm2)) / 2))
 
 
+def known_targets(record: CaseRecord) -> list[KnownTarget]:
+    """Every target with the procedures that approached it, in the order in which they were set."""
+    approaches: dict[int, list[int]] = {}
+    for row in record.procedures():
+        number = row.arguments.get("target") if row.name in APPROACHES else None
+        if number is not None:
+            approaches.setdefault(number, []).append(row.procedure_id)
+    current = current_target(record)
+    return [
+        KnownTarget(
+            **vars(target_of(event)),
+            current=current is not None and current.number == event.event_id,
+            set_s=event.wall_s,
+            who=event.who,
+            approaches=approaches.get(event.event_id, []),
+        )
+        for event in record.events_of_kind(TARGET_SET)
+    ]
+
+
 def targets_over_time(record: CaseRecord) -> Targets:
-    events = record.events_of_kind("target_set")
+    events = [*record.events_of_kind(TARGET_SET), *record.events_of_kind(TARGET_WITHDRAWN)]
+    events.sort(key=lambda event: event.event_id)
     return Targets(
         tuple(event.wall_s for event in events),
-        tuple(tuple(event.body["patient_mm"]) for event in events),
+        tuple(target_of(e).patient_mm if e.kind == TARGET_SET else None for e in events),
     )
 
 
+def case_folder(case_dir: Path, name: str | None) -> Path:
+    """The folder of the present case (None) or of one beside it; CaseRecordError if there is none.
+
+    Only names of folders that are there and hold a record lead anywhere: no path gets through.
+    """
+    if name is None:
+        return case_dir
+    for folder in _case_folders(case_dir):
+        if folder.name == name:
+            return folder
+    raise CaseRecordError(f"There is no case in a folder {name!r} beside the present one.")
+
+
+def _case_folders(case_dir: Path) -> list[Path]:
+    beside = (path.parent for path in case_dir.parent.glob(f"*/{FILE_NAME}"))
+    return sorted({case_dir, *beside})[:_MOST_CASES]
+
+
 def past_cases(case_dir: Path) -> list[CaseSummary]:
-    """Every case folder beside `case_dir`, and itself, newest first; others are not touched."""
-    found = [case_dir, *(path.parent for path in case_dir.parent.glob(f"*/{FILE_NAME}"))]
+    """Every case folder beside `case_dir`, and itself, newest first; nothing is written there."""
     summaries = []
-    for folder in sorted(set(found))[:_MOST_CASES]:
+    for folder in _case_folders(case_dir):
         try:
-            with CaseRecord(folder) as record:
+            with CaseRecord(folder, read_only=True) as record:
                 summaries.append(_summary(record, folder, folder == case_dir))
         except CaseRecordError:
             continue  # a record of a newer program, or none: not ours to show

@@ -27,6 +27,16 @@ class ImagePlane:
             [point @ np.array(self.row_direction), point @ np.array(self.col_direction)]
         )
 
+    @property
+    def normal(self) -> NDArray[np.float64]:
+        """Unit vector (3,), patient LPS: column direction x row direction."""
+        return np.cross(self.col_direction, self.row_direction)
+
+    def direction(self, plane_mm: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Plane mm (2,) -> the vector (3,) in the plane through the patient's origin."""
+        rows, cols = np.array(self.row_direction), np.array(self.col_direction)
+        return np.asarray(plane_mm[0] * rows + plane_mm[1] * cols)
+
     def is_parallel_to(self, other: ImagePlane) -> bool:
         """True if a position in the other plane's coordinates means the same here."""
         pairs = (

@@ -20,7 +20,7 @@ ConfigOption = Annotated[Path, typer.Option("--config", help="The room's TOML fi
 ParentOption = Annotated[
     bool, typer.Option("--exit-with-parent", help="End when standard input is closed.")
 ]
-_SWITCH_INTERVAL_S = 0.001
+_SWITCH_INTERVAL_S = 0.0002
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 

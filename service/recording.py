@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from service.calibration import Calibration
 from service.estimate import FiducialEstimate, MotionNoise
-from service.looking import STRATEGIES, LookArguments, look_at_fiducial, look_longer
+from service.looking import STRATEGIES, Look, LookArguments, look_at_fiducial, look_longer
 from service.sensing import check_prediction
 from service.steps import ProcedureSteps
 
@@ -32,7 +34,35 @@ class RecordingArguments:
         return MotionNoise(self.repeatability_mm, self.scale_error)
 
 
-def record_place(arguments: RecordingArguments, start: Calibration) -> ProcedureSteps[Calibration]:
+@dataclass(frozen=True, eq=False)
+class Place:
+    """Where the fiducial is: what is known now, and what finding it out took."""
+
+    calibration: Calibration
+    frames: int
+    scan_s: float
+
+    def patient_mm(self, found: Mapping[str, Any]) -> list[float]:
+        """Patient mm (LPS, 3) of the place; `found` is what the worker wrote of its measurement.
+
+        Along the slice normal it is where the slice lies.
+        """
+        better_mm = self.calibration.estimate.plane_mm - np.array(found["plane_mm"])
+        step_mm = self.calibration.plane.direction(better_mm)
+        return [float(value) for value in np.array(found["patient_mm"]) + step_mm]
+
+    def to_json(self) -> dict[str, Any]:
+        estimate = self.calibration.estimate
+        return {
+            "calibration": self.calibration.to_json(),
+            "measurement_id": self.calibration.measurement_id,
+            "sigma_mm": float(np.sqrt(np.trace(estimate.covariance_mm2) / 2)),
+            "frames": self.frames,
+            "scan_s": self.scan_s,
+        }
+
+
+def record_place(arguments: RecordingArguments, start: Calibration) -> ProcedureSteps[Place]:
     """Return `start` with the estimate of where the fiducial is, the robot standing still.
 
     A strategy that fuses takes as many slices as the bound asks for; the paper's take one look.
@@ -44,12 +74,18 @@ def record_place(arguments: RecordingArguments, start: Calibration) -> Procedure
     look = yield from look_at_fiducial(strategy.fine, start, looking, number=0, fresh=True)
     check_prediction(start.estimate, look.found, arguments.gate_sigma, arguments.noise)
     if not strategy.fuses or look.acquired is None:
-        return replace(start, estimate=look.found, measurement_id=look.measured.measurement_id)
+        return _place(start, look.found, look)
     wanted = slices_for(look.found, look.measured.frames, arguments.sigma_mm)
     if wanted > look.measured.frames:
         look = yield from look_longer(look, look.acquired, looking, frames=wanted)
     estimate = look.prior.fused_with(look.found.plane_mm, look.found.covariance_mm2)
-    return replace(start, estimate=estimate, measurement_id=look.measured.measurement_id)
+    return _place(start, estimate, look)
+
+
+def _place(start: Calibration, estimate: FiducialEstimate, look: Look) -> Place:
+    measured = look.measured
+    calibration = replace(start, estimate=estimate, measurement_id=measured.measurement_id)
+    return Place(calibration, measured.frames, measured.scan_s)
 
 
 def slices_for(found: FiducialEstimate, frames: int, sigma_mm: float) -> int:

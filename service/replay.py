@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -24,7 +24,13 @@ from service.runner import ReplayMismatchError, same_step
 from service.sensing import ProcedureFailedError
 from service.steps import outcome_from_json
 from sr_engine.errors import EngineError
-from sr_engine.worker import UnusableSlicesError, describe_result, gather_frames, localize_request
+from sr_engine.worker import (
+    Frames,
+    UnusableSlicesError,
+    describe_result,
+    gather_frames,
+    localize_request,
+)
 
 app = typer.Typer(add_completion=False)
 METHODS = ("ml", "base", "bicubic", "sr")
@@ -141,7 +147,7 @@ def _replay_one(record: CaseRecord, row: Measurement, method: str) -> ReplayedMe
     frames, reason = 0, ""
     replayed = sigma = None
     try:
-        taken = gather_frames(record, row)
+        taken = _frames_then(gather_frames(record, row), row)
         frames = len(taken.pixels)
         found = describe_result(taken, localize_request(taken, method, row.request))
         replayed = np.array(found["plane_mm"])
@@ -160,6 +166,23 @@ def _replay_one(record: CaseRecord, row: Measurement, method: str) -> ReplayedMe
         difference,
         sigma,
         reason,
+    )
+
+
+def _frames_then(frames: Frames, row: Measurement) -> Frames:
+    """Only the slices that were there then: more may have been taken at the same hold later."""
+    known = (row.result or {}).get("slice_ids")
+    if known is None:
+        until_s = np.inf if row.finished_s is None else row.finished_s
+        known = [one.slice_id for one in frames.slices if one.received_s <= until_s]
+    then = [number for number, one in enumerate(frames.slices) if one.slice_id in known]
+    if not then:
+        raise UnusableSlicesError("no_slices", "the slices of this measurement are not assigned")
+    return replace(
+        frames,
+        pixels=frames.pixels[then],
+        shifts_px=frames.shifts_px[then],
+        slices=tuple(frames.slices[number] for number in then),
     )
 
 

@@ -20,8 +20,8 @@ from matplotlib.patches import Ellipse
 from case_record.record import CaseRecord
 from case_record.rows import Measurement
 from service.images import ImageMissingError, slice_pixels
-from service.past import targets_over_time
-from service.procedures import APPROACH, CALIBRATION
+from service.past import known_targets, targets_over_time
+from service.procedures import APPROACHES, CALIBRATIONS
 
 app = typer.Typer(add_completion=False)
 _CROP_PX = 16
@@ -72,7 +72,9 @@ def report_page(record: CaseRecord) -> str:
         f"<h1>{html.escape(title)}</h1>",
         '<p class="warning">Research software, not a medical device.</p>',
         f"<p>Case {html.escape(case.case_uid)}, {events} events, their chain verifies.</p>",
+        *_targets(record),
         *_approaches(record),
+        *_needles(record),
         *_calibrations(record),
         *_plots(record),
         *_images(record),
@@ -84,16 +86,67 @@ def report_page(record: CaseRecord) -> str:
     return f"<!DOCTYPE html><html lang=en><head>{head}</head><body>{''.join(body)}</body></html>\n"
 
 
+def _targets(record: CaseRecord) -> Iterable[str]:
+    rows = [
+        (
+            target.number,
+            target.label,
+            " ".join(f"{value:.3f}" for value in target.patient_mm),
+            "tissue" if target.in_water else "fiducial",
+            _time(target.set_s),
+            target.who,
+            ", ".join(str(number) for number in target.approaches),
+        )
+        for target in known_targets(record)
+    ]
+    yield "<h2>Targets</h2>"
+    yield _table(("no.", "label", "patient mm (LPS)", "of", "set", "by", "approaches"), rows)
+
+
+def _needles(record: CaseRecord) -> Iterable[str]:
+    """With two fiducials: where the needle's line runs at the end of each approach."""
+    rows = []
+    for row in record.procedures():
+        result = row.result or {}
+        if row.state != "done" or "tip_mm" not in result:
+            continue
+        covariance = np.array(result["tip_covariance_mm2"])
+        rows.append(
+            (
+                row.procedure_id,
+                *(" ".join(f"{x:.3f}" for x in result[name]) for name in ("joint_mm", "tip_mm")),
+                _number(result["tip_below_joint_mm"], 1, 1),
+                " ".join(f"{1000 * x:+.0f}" for x in result["tip_error_mm"]),
+                " ".join(f"{1000 * x:.0f}" for x in np.sqrt(np.diag(covariance))),
+                _number(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]), 1, 2),
+            )
+        )
+    if rows:
+        yield "<h2>Where the needle points</h2>"
+        heads = (
+            "approach",
+            "lower ball joint, patient mm",
+            "tip, patient mm",
+            "depth mm",
+            "tip error µm (row, col)",
+            "σ µm (row, col)",
+            "correlation",
+        )
+        yield _table(heads, rows)
+
+
 def _approaches(record: CaseRecord) -> Iterable[str]:
     rows = []
     for row in record.procedures():
-        if row.name != APPROACH:
+        if row.name not in APPROACHES:
             continue
         result = dict(row.result or {})
         minutes = ((row.ended_s or row.started_s) - row.started_s) / 60
         rows.append(
             (
                 row.procedure_id,
+                row.name.replace("_", " "),
+                row.arguments.get("target", ""),
                 row.state,
                 *(_number(result.get(name), 1000) for name in ("error_mm", "sigma_mm")),
                 _number(result.get("probability"), 1, 3),
@@ -104,7 +157,19 @@ def _approaches(record: CaseRecord) -> Iterable[str]:
             )
         )
     yield "<h2>Approaches</h2>"
-    heads = ("no.", "state", "error µm", "σ µm", "P", "moves", "slices", "min", "reason")
+    heads = (
+        "no.",
+        "",
+        "target",
+        "state",
+        "error µm",
+        "σ µm",
+        "P",
+        "moves",
+        "slices",
+        "min",
+        "reason",
+    )
     yield _table(heads, rows)
     yield f"<p>Punctures recorded: {len(record.events_of_kind('puncture'))}.</p>"
 
@@ -113,15 +178,17 @@ def _calibrations(record: CaseRecord) -> Iterable[str]:
     yield "<h2>Calibrations</h2>"
     rows = []
     for row in record.procedures():
-        if row.name != CALIBRATION:
+        if row.name not in CALIBRATIONS:
             continue
         found = dict(row.result or {})
         columns = found.get("jacobian", {}).get("columns")
         shown = (
             "" if columns is None else "; ".join(" ".join(f"{x:+.4f}" for x in r) for r in columns)
         )
-        rows.append((row.procedure_id, row.state, shown, found.get("reason", "")))
-    yield _table(("no.", "state", "image Jacobian mm/mm (rows; per axis up, down)", "reason"), rows)
+        axes = ", ".join(found.get("jacobian", {}).get("axes", ()))
+        rows.append((row.procedure_id, row.state, axes, shown, found.get("reason", "")))
+    heads = ("no.", "state", "axes", "image Jacobian mm/mm (rows; per axis up, down)", "reason")
+    yield _table(heads, rows)
 
 
 def _plots(record: CaseRecord) -> Iterable[str]:
@@ -148,7 +215,7 @@ def _images(record: CaseRecord) -> Iterable[str]:
     """The last slice of every approach around the fiducial, with its 95 % ellipse."""
     shown = []
     for row in record.procedures():
-        if row.name == APPROACH and row.state == "done" and row.result:
+        if row.name in APPROACHES and row.state == "done" and row.result:
             measurement = record.measurement(int(row.result["measurement_id"]))
             tag = _close_up(record, measurement, f"approach {row.procedure_id}")
             if tag:

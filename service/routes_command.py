@@ -16,11 +16,13 @@ from service.bodies import (
     HoldBody,
     JogBody,
     PointBody,
+    ProcedureBody,
     PunctureBody,
     ReasonBody,
     Started,
     StopBody,
     TargetBody,
+    TargetHereBody,
 )
 from service.control import ControlLoop
 from service.once import Once
@@ -117,7 +119,10 @@ def command_router(loop: ControlLoop) -> APIRouter:
 
     @router.post("/api/v1/reset", tags=["robot"], status_code=204, responses=_REFUSALS)
     def reset(body: Ask, caller: Caller, key: Key = None) -> None:
-        """Clear a latched stop, take the positions as they stand, and arm."""
+        """Clear a latched stop, take the positions as they stand, and arm.
+
+        Controllers that count from zero again are taken to stand where they were last recorded.
+        """
         orders.carry_out(caller, key, "reset", body)
 
     @router.post("/api/v1/jog", tags=["robot"], status_code=202, responses=_REFUSALS)
@@ -126,7 +131,7 @@ def command_router(loop: ControlLoop) -> APIRouter:
         return Started(procedure_id=orders.carry_out(caller, key, "jog", body))
 
     @router.post("/api/v1/calibration", tags=["procedure"], status_code=202, responses=_REFUSALS)
-    def calibration(body: Ask, caller: Caller, key: Key = None) -> Started:
+    def calibration(body: ProcedureBody, caller: Caller, key: Key = None) -> Started:
         """Start the calibration."""
         return Started(procedure_id=orders.carry_out(caller, key, "start_calibration", body))
 
@@ -142,13 +147,25 @@ def command_router(loop: ControlLoop) -> APIRouter:
         """Withdraw the target; nothing is approached until another one is set."""
         orders.carry_out(caller, key, "withdraw_target", body)
 
+    @router.post("/api/v1/target/here", tags=["procedure"], status_code=202, responses=_REFUSALS)
+    def target_here(body: TargetHereBody, caller: Caller, key: Key = None) -> Started:
+        """Look as closely as the tolerance asks for: where the fiducial is becomes the target."""
+        return Started(procedure_id=orders.carry_out(caller, key, "record_target", body))
+
+    @router.post(
+        "/api/v1/targets/{number}/choose", tags=["procedure"], status_code=204, responses=_REFUSALS
+    )
+    def choose_target(number: Id, body: Ask, caller: Caller, key: Key = None) -> None:
+        """Take a target of this case again."""
+        orders.carry_out(caller, key, "choose_target", body, number=number)
+
     @router.put("/api/v1/entry", tags=["procedure"], status_code=204, responses=_REFUSALS)
     def entry(body: PointBody, caller: Caller, key: Key = None) -> None:
         """Set the planned skin point, patient mm (LPS)."""
         orders.carry_out(caller, key, "set_entry", body)
 
     @router.post("/api/v1/approach", tags=["procedure"], status_code=202, responses=_REFUSALS)
-    def approach(body: Ask, caller: Caller, key: Key = None) -> Started:
+    def approach(body: ProcedureBody, caller: Caller, key: Key = None) -> Started:
         """Start the approach to the target."""
         return Started(procedure_id=orders.carry_out(caller, key, "start_approach", body))
 

@@ -69,6 +69,23 @@ class MeasurementState(_Frozen):
     has_reconstruction: bool = False
 
 
+class FiducialState(_Frozen):
+    """The guide's other fiducial, where it was last seen (in another slice than the newest)."""
+
+    measurement_id: int
+    patient_mm: tuple[float, float, float]
+    radius_mm: float
+
+
+class ClockState(_Frozen):
+    """How the scanner's clock goes: ours minus the scanner's; compared_s None: as configured."""
+
+    offset_s: float
+    uncertainty_s: float
+    compared_s: float | None = None
+    who: str = ""
+
+
 class ErrorState(_Frozen):
     """How far the fiducial is from the target, in the image plane (row, col) mm."""
 
@@ -81,7 +98,11 @@ class ErrorState(_Frozen):
 
 
 class ArrivalState(_Frozen):
-    """READY: how the needle guide came to the target, and how sure that is."""
+    """READY: how the needle guide came to the target, and how sure that is.
+
+    With two fiducials the error is that of the needle's tip, and the last fields say where it is:
+    (row, col) in the image plane, depth below the lower ball joint, both points in patient LPS mm.
+    """
 
     procedure_id: int
     measurement_id: int
@@ -91,6 +112,11 @@ class ArrivalState(_Frozen):
     iterations: int
     frames: int
     scan_s: float
+    tip_error_mm: tuple[float, float] | None = None
+    tip_covariance_mm2: tuple[tuple[float, float], tuple[float, float]] | None = None
+    tip_below_joint_mm: float | None = None
+    tip_mm: tuple[float, float, float] | None = None
+    joint_mm: tuple[float, float, float] | None = None
 
 
 class SliceState(_Frozen):
@@ -178,6 +204,7 @@ class RoomState(_Frozen):
     slices: dict[str, int] = {}
     measurement: MeasurementState | None = None
     calibrated: bool = False
+    guide: bool = False
     target_patient_mm: tuple[float, float, float] | None = None
     error: ErrorState | None = None
     tolerance_mm: float
@@ -186,6 +213,8 @@ class RoomState(_Frozen):
     case: CaseState | None = None
     slice: SliceState | None = None
     reconstruction: ReconstructionState | None = None
+    other_fiducial: FiducialState | None = None
+    clock: ClockState | None = None
     hold: HoldState | None = None
     entry_patient_mm: tuple[float, float, float] | None = None
     punctured: bool = False
@@ -203,5 +232,6 @@ class RoomState(_Frozen):
             room=config.room.name,
             virtual=config.room.virtual,
             arrival_mode=config.listener.arrival_mode,
+            guide=config.service.guide is not None,
             tolerance_mm=config.service.tolerance_mm,
         )

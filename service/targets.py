@@ -16,12 +16,13 @@ from numpy.typing import NDArray
 
 from case_record.record import CaseRecord
 from case_record.rows import Event
-from service.guide import GuideGeometry, state_on_line
+from service.guide_geometry import GuideGeometry, state_on_line
 from service.kinematics import KinematicsError, line_from_entry_and_target
 from service.plane import ImagePlane
 
 Array = NDArray[np.float64]
 TARGET_SET, TARGET_WITHDRAWN = "target_set", "target_withdrawn"
+ENTRY_SET = "entry_set"
 OIL_WATER_PPM = 3.4
 
 
@@ -46,6 +47,15 @@ def current_target(record: CaseRecord) -> Target | None:
     if last is None or (withdrawn is not None and withdrawn.event_id > last.event_id):
         return None
     return target_of(last)
+
+
+def current_entry(record: CaseRecord) -> tuple[float, float, float] | None:
+    """The planned skin point that was set last, patient mm (LPS)."""
+    event = record.last_event(ENTRY_SET)
+    if event is None:
+        return None
+    x, y, z = event.body["patient_mm"]
+    return x, y, z
 
 
 def all_targets(record: CaseRecord) -> list[Target]:
@@ -100,30 +110,47 @@ def fiducial_must_appear_at(
     return place + oil_shift_mm(header, plane.spacing_mm, polarity)
 
 
-def guide_must_appear_at(
+@dataclass(frozen=True, eq=False)
+class NeedleLine:
+    """Where the guide is to be: its line upwards from the lower ball joint, and how deep to go."""
+
+    joint_mm: Array
+    direction: Array
+    depth_mm: float
+
+    def state(
+        self, geometry: GuideGeometry, plane: ImagePlane, oil_shift: Array | None = None
+    ) -> Array:
+        """How it is seen then: (4,), both fiducials in the image plane."""
+        state = state_on_line(geometry, self.joint_mm, self.direction, plane)
+        return state if oil_shift is None else state + np.tile(oil_shift, 2)
+
+
+def needle_line(
     entry_mm: Sequence[float],
     target_mm: Sequence[float],
-    geometry: GuideGeometry,
     plane: ImagePlane,
-    lower_joint_position_mm: float,
-    oil_shift: Array | None = None,
-) -> Array:
-    """The state (4,) of a guide on the line from entry to target (patient mm, both in tissue).
+    lower_plane_mm: float,
+    upper_plane_mm: float,
+) -> NeedleLine:
+    """The guide's line through entry and target (patient mm), for planes along the slice normal.
 
-    lower_joint_position_mm: of the lower ball joint along the slice normal. Raises TargetError for
-    points that make no line, or one that runs in the slice's plane.
+    Raises TargetError for points that make no line, one that is too flat, or a target that does not
+    lie below the lower ball joint.
     """
     try:
         line = line_from_entry_and_target(entry_mm, target_mm)
     except KinematicsError as error:
         raise TargetError(f"entry and target: {error}") from error
-    normal = np.cross(plane.col_direction, plane.row_direction)
-    along = float(normal @ line.direction)
+    along = float(plane.normal @ line.direction)
     if not abs(along) > 0.5:
         raise TargetError("the needle would lie flatter than 30° to the slices")
-    # the guide's direction is upwards, from the lower to the upper fiducial
-    upper, lower = geometry.slice_positions_mm
-    direction = line.direction * np.sign(along) * np.sign(upper - lower)
-    reach = (lower_joint_position_mm - float(normal @ line.point_mm)) / float(normal @ direction)
-    state = state_on_line(geometry, line.point_mm + reach * direction, direction, plane)
-    return state if oil_shift is None else state + np.tile(oil_shift, 2)
+    direction = line.direction * np.sign(along) * np.sign(upper_plane_mm - lower_plane_mm)
+    depth_mm = (lower_plane_mm - float(plane.normal @ line.point_mm)) / float(
+        plane.normal @ direction
+    )
+    if not depth_mm > 0:
+        raise TargetError(
+            f"the target lies {-depth_mm:.1f} mm above the lower plane: the needle cannot go there"
+        )
+    return NeedleLine(line.point_mm + depth_mm * direction, direction, depth_mm)

@@ -13,7 +13,7 @@ import typer
 
 from room_config.load import ConfigError, read_toml
 from simulator.config import VirtualRoom, VirtualRoomError, parse_virtual_room
-from simulator.scan_operator import operate
+from simulator.scan_operator import operate, read_token
 
 BAD_INPUT = 2
 
@@ -36,7 +36,8 @@ def scanner(
         assert room.scanner is not None
         stop = _stop_event(exit_with_parent)
         ready = {"ready": "scanner", "truth_file": room.scanner.truth_file}
-        operate(room, stop, _note, lambda: print(json.dumps(ready), flush=True))
+        token = read_token(room.scanner, os.environ)
+        operate(room, stop, _note, lambda: print(json.dumps(ready), flush=True), token)
     except (ConfigError, VirtualRoomError) as error:
         print(error, file=sys.stderr)
         raise typer.Exit(BAD_INPUT) from None
@@ -50,8 +51,12 @@ def _virtual_room(path: Path) -> VirtualRoom:
     if room.scanner is None:
         raise VirtualRoomError(f"{path}: virtual.scanner: missing table")
     # Relative to the configuration, as every path in it.
-    truth_file = str((path.parent / room.scanner.truth_file).resolve())
-    scanner = room.scanner.model_copy(update={"truth_file": truth_file})
+    paths = {
+        name: str((path.parent / getattr(room.scanner, name)).resolve())
+        for name in ("truth_file", "token_file")
+        if getattr(room.scanner, name)
+    }
+    scanner = room.scanner.model_copy(update=paths)
     return room.model_copy(update={"scanner": scanner})
 
 

@@ -173,6 +173,9 @@ class ScannerSettings(_Table):
 
     service_url: Annotated[str, Field(pattern=r"^https?://[^\s/]+")]
     """Address of the service, which says what to acquire next."""
+    token_file: str = ""
+    """File with the token that the service asks for; relative to the configuration. The environment
+    variable AUTOSPINE_TOKEN goes before it. Empty: the service asks for none."""
     listener_host: str = "127.0.0.1"
     """Where slices are sent to."""
     listener_port: Port

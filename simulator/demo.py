@@ -19,8 +19,9 @@ from rich.console import Console
 
 from case_record.record import CaseRecord
 from service.children import ChildError, quiet_environment
+from service.client import RoomClient
 from simulator.config import parse_virtual_room
-from simulator.demo_operator import DemoFailedError, Operator
+from simulator.demo_operator import WHO, DemoFailedError, Operator
 from simulator.demo_room import DemoOptions, DemoRoom, known_faults
 from simulator.demo_screen import DemoScreen, final_table
 from simulator.truth_client import TruthAddress
@@ -46,8 +47,14 @@ def demo(
     fault: Annotated[
         list[str] | None, typer.Option(help=f"One of: {', '.join(known_faults())}.")
     ] = None,
+    guide: Annotated[
+        bool, typer.Option("--guide", help="Two fiducials and four axes: the needle's tip.")
+    ] = False,
     page_port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 0,
     dicom_port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 0,
+    tokens: Annotated[
+        bool, typer.Option("--tokens", help="Ask for a token, as a room on a network does.")
+    ] = False,
 ) -> int:
     """The whole room, virtual: calibration and punctures, unattended."""
     quiet_environment()
@@ -61,7 +68,10 @@ def demo(
     folder.mkdir(parents=True, exist_ok=True)
     code = INTERRUPTED
     with _signals():
-        options = DemoOptions(folder, seed, tuple(fault or ()), page_port, dicom_port)
+        faults = tuple(fault or ())
+        options = DemoOptions(
+            folder, seed, faults, page_port, dicom_port, tokens=tokens, guide=guide
+        )
         code = _run(DemoRoom(options), punctures, leave=exit_, as_json=json_)
     if case is None and code != COULD_NOT:
         shutil.rmtree(folder, ignore_errors=True)  # what failed may be gone on with
@@ -75,10 +85,13 @@ def _run(room: DemoRoom, punctures: int, *, leave: bool, as_json: bool) -> int:
         screen.note("starting the processes of the virtual room")
         room.start()
         screen.note(f"page: {room.url}")
+        if room.operator_token:
+            screen.note(f"log in there as operator with the token {room.operator_token}")
         virtual = parse_virtual_room(room.virtual_table)
         truth = TruthAddress("127.0.0.1", room.truth_port)
         results_file = room.virtual_dir / "punctures.jsonl"
-        operator = Operator(room.url, virtual, truth, results_file, room.options.seed)
+        client = RoomClient(room.url, token=room.operator_token, by=WHO)
+        operator = Operator(client, virtual, truth, results_file, room.options.seed)
         with screen:
             operator.run(punctures, lambda s: screen.show(s, operator), room.check)
         with CaseRecord(room.folder) as record:

@@ -18,7 +18,7 @@ import numpy as np
 
 from service.client import RefusedByServiceError, RoomClient, ServiceGoneError
 from simulator.config import VirtualRoom
-from simulator.scene import true_fiducial_mm
+from simulator.scene import true_fiducial_mm, true_guide
 from simulator.truth_client import TruthAddress, ask_where
 
 WHO = "virtual operator"
@@ -27,6 +27,8 @@ _NOT_NOW = 409
 _PATIENCE_S = 90.0
 _MOST_FAILURES = 4
 _TARGET_REACH_MM = 7.0
+# with four axes: the skin and the target, below the plane of the lower ball joints
+_ENTRY_DEPTH_MM, _TARGET_DEPTH_MM = 25.0, 80.0
 _ASKED_IN_VAIN = 4
 _CLOCK_READING_S = 0.02
 
@@ -58,9 +60,14 @@ class Operator:
     """Drives a case to the wanted number of punctures through the API alone."""
 
     def __init__(
-        self, url: str, room: VirtualRoom, truth: TruthAddress, results_file: Path, seed: int
+        self,
+        client: RoomClient,
+        room: VirtualRoom,
+        truth: TruthAddress,
+        results_file: Path,
+        seed: int,
     ) -> None:
-        self._client = RoomClient(url, by=WHO)
+        self._client = client
         self._room = room
         self._truth = truth
         self._results_file = results_file
@@ -158,9 +165,13 @@ class Operator:
 
     def _result(self, arrival: dict[str, Any], target_mm: list[float]) -> PunctureResult:
         stages = ask_where(self._truth)
-        fiducial_mm = true_fiducial_mm(self._room, stages.positions_mm)
+        depth_mm = arrival["tip_below_joint_mm"]
+        if depth_mm is None:
+            there_mm = true_fiducial_mm(self._room, stages.positions_mm)
+        else:
+            there_mm = true_guide(self._room, stages.positions_mm).at(-depth_mm)
         # the needle guide is steered in the coronal plane: left-right and foot-head
-        miss = (np.asarray(fiducial_mm) - np.asarray(target_mm))[[0, 2]]
+        miss = (np.asarray(there_mm) - np.asarray(target_mm))[[0, 2]]
         return PunctureResult(
             procedure_id=arrival["procedure_id"],
             true_error_mm=float(np.linalg.norm(miss)),
@@ -174,9 +185,23 @@ class Operator:
     def _set_target(self, state: dict[str, Any]) -> None:
         """A point within reach, the same one for the same seed and puncture."""
         rng = np.random.default_rng((self._seed, len(self.results)))
-        along_x, along_z = rng.uniform(-_TARGET_REACH_MM, _TARGET_REACH_MM, 2).tolist()
         x, y, z = self._origin_mm(state)
+        if state["guide"]:
+            self._set_needle(rng, (x, z))
+            return
+        along_x, along_z = rng.uniform(-_TARGET_REACH_MM, _TARGET_REACH_MM, 2).tolist()
         self._order(self._client.set_target, (x + along_x, y, z + along_z))
+
+    def _set_needle(self, rng: np.random.Generator, below: tuple[float, float]) -> None:
+        """An entry point and a target below the lower plane, near the upright guide's line."""
+        placement = self._room.placement
+        lower_plane_mm = placement.origin_mm[1] + placement.bottom_plane_mm
+        points = []
+        for depth_mm, reach_mm in ((_ENTRY_DEPTH_MM, 2.0), (_TARGET_DEPTH_MM, 3.0)):
+            along_x, along_z = rng.uniform(-reach_mm, reach_mm, 2).tolist()
+            points.append((below[0] + along_x, lower_plane_mm - depth_mm, below[1] + along_z))
+        self._order(self._client.set_entry, points[0])
+        self._order(self._client.set_target, points[1])
 
     def _origin_mm(self, state: dict[str, Any]) -> tuple[float, float, float]:
         """Where the fiducial was seen at the end of the calibration; kept for later targets."""

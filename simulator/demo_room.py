@@ -14,12 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from service.access import new_token, token_hash
 from service.children import ChildError, Family, autospine
-from simulator.config import parse_virtual_room
+from simulator.config import VirtualRoom, parse_virtual_room
 from simulator.faults import FAULTS
 from simulator.truth_client import TruthAddress, TruthError, ask_where
 
-AXES = ("xt", "yt")
+AXES, GUIDE_AXES = ("xt", "yt"), ("xt", "yt", "xb", "yb")
+UPPER_ALONG_MM, LOWER_ALONG_MM = 48.0, 14.0
 _TRAVEL_MM = 20.0
 _CONFIG = "room.toml"
 _CLOCK_OFFSET_S = 37.2
@@ -27,7 +29,10 @@ _CLOCK_OFFSET_S = 37.2
 
 @dataclass(frozen=True)
 class DemoOptions:
-    """What the user chose; port 0 means any free one."""
+    """What the user chose; port 0 means any free one.
+
+    tokens: the room asks for tokens. guide: two fiducials and four axes.
+    """
 
     case_dir: Path
     seed: int
@@ -35,6 +40,8 @@ class DemoOptions:
     page_port: int = 0
     dicom_port: int = 0
     speed_factor: float = 3.0
+    tokens: bool = False
+    guide: bool = False
 
 
 class PortInUseError(Exception):
@@ -55,6 +62,11 @@ class DemoRoom:
         self.url = ""
         self.truth_port = 0
         self.virtual_table: dict[str, Any] = {}
+        self.operator_token = new_token() if options.tokens else ""
+
+    @property
+    def axes(self) -> tuple[str, ...]:
+        return GUIDE_AXES if self.options.guide else AXES
 
     @property
     def truth_file(self) -> Path:
@@ -104,7 +116,7 @@ class DemoRoom:
         return [
             *(sys.executable, "-m", "simulator.motors"),
             *("--pty-path", str(self.virtual_dir / "controllers")),
-            *("--axes", ",".join(AXES)),
+            *("--axes", ",".join(self.axes)),
             *("--seed", str(self.options.seed)),
             *("--state", str(self.virtual_dir / "stages.json")),
             *("--speed-factor", str(self.options.speed_factor)),
@@ -145,9 +157,15 @@ class DemoRoom:
                 "motors_truth_port": self.truth_port,
                 "truth_file": str(self.truth_file),
                 "clock_offset_s": _CLOCK_OFFSET_S,
+                **({"token_file": str(self._token_file)} if self.options.tokens else {}),
             },
         }
-        parse_virtual_room(self.virtual_table)
+        if self.options.guide:
+            self.virtual_table["fiducials"] = [
+                {"name": name, "mount": "guide", "along_guide_mm": along_mm}
+                for name, along_mm in (("upper", UPPER_ALONG_MM), ("lower", LOWER_ALONG_MM))
+            ]
+        virtual = parse_virtual_room(self.virtual_table)
         line = self.virtual_dir / "line-service"
         tables = {
             "room": {"name": "virtual room", "case_dir": str(self.folder), "virtual": True},
@@ -178,12 +196,34 @@ class DemoRoom:
                 "state_dir": str(self.virtual_dir / "bridge"),
             },
         }
-        axes = [self._axis_table(name, number) for number, name in enumerate(AXES, start=1)]
+        if self.options.guide:
+            tables["service.guide"] = _guide_table(virtual)
+        axes = [self._axis_table(name, number) for number, name in enumerate(self.axes, start=1)]
         path = self.folder / _CONFIG
         text = "# Written by `autospine demo`.\n" + _toml(tables)
         text += "".join(f"\n[[bridge.axis]]\n{_toml_keys(axis)}" for axis in axes)
+        text += "".join(f"\n[[service.token]]\n{_toml_keys(t)}" for t in self._token_tables())
         path.write_text(text, encoding="utf-8")
         return path
+
+    def _token_tables(self) -> list[dict[str, str]]:
+        """Who may use the service; the scanner finds its own token in its file."""
+        if not self.options.tokens:
+            return []
+        scanner_token = new_token()
+        self._token_file.touch(mode=0o600)
+        self._token_file.write_text(scanner_token, encoding="ascii")
+        return [
+            {"name": name, "role": role, "sha256": token_hash(token)}
+            for name, role, token in (
+                ("operator", "operator", self.operator_token),
+                ("scanner", "viewer", scanner_token),
+            )
+        ]
+
+    @property
+    def _token_file(self) -> Path:
+        return self.virtual_dir / "scanner.token"
 
     def _axis_table(self, name: str, address: int) -> dict[str, Any]:
         return {
@@ -198,6 +238,25 @@ class DemoRoom:
             "step_um_forward": 4.5,
             "step_um_reverse": 4.5,
         }
+
+
+def _guide_table(virtual: VirtualRoom) -> dict[str, Any]:
+    """`[service.guide]` as somebody would measure it at the robot, which stands a little askew."""
+    placement = virtual.placement
+    # the robot's z is posterior, as the normal of a coronal slice
+    upper_mm, lower_mm = (
+        placement.origin_mm[1] + height_mm
+        for height_mm in (placement.top_plane_mm, placement.bottom_plane_mm)
+    )
+    return {
+        "axes": list(GUIDE_AXES),
+        "upper_plane_mm": upper_mm,
+        "lower_plane_mm": lower_mm,
+        "upper_fiducial_mm": UPPER_ALONG_MM,
+        "lower_fiducial_mm": LOWER_ALONG_MM,
+        "upper_slice_mm": lower_mm + UPPER_ALONG_MM,
+        "lower_slice_mm": lower_mm + LOWER_ALONG_MM,
+    }
 
 
 def known_faults() -> Sequence[str]:
@@ -218,6 +277,8 @@ def _toml_value(value: Any) -> str:
     if isinstance(value, str):
         escaped = value.replace("\\", "\\\\").replace('"', '\\"')
         return f'"{escaped}"'
+    if isinstance(value, Mapping):
+        return "{" + ", ".join(f"{key} = {_toml_value(item)}" for key, item in value.items()) + "}"
     if isinstance(value, list | tuple):
         return "[" + ", ".join(_toml_value(item) for item in value) + "]"
     return repr(value)

@@ -2,18 +2,38 @@
 
 import contextlib
 import threading
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import asdict
 from pathlib import Path
 
 import httpx
 from pydantic import ValidationError
 
-from simulator.config import VirtualRoom, VirtualRoomError
+from simulator.config import ScannerSettings, VirtualRoom, VirtualRoomError
 from simulator.outbox import Delivery, Outbox
 from simulator.scanner import AcquisitionRequest, Note, VirtualScanner
 from simulator.truth_client import TruthError
 from simulator.truth_file import TruthFile
+
+TOKEN_VARIABLE = "AUTOSPINE_TOKEN"
+
+
+def read_token(settings: ScannerSettings, environment: Mapping[str, str]) -> str:
+    """The token for the service, or '' where none is needed; VirtualRoomError if not readable."""
+    if environment.get(TOKEN_VARIABLE):
+        return environment[TOKEN_VARIABLE].strip()
+    if not settings.token_file:
+        return ""
+    try:
+        token = Path(settings.token_file).read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError) as error:
+        why = getattr(error, "strerror", None) or "not text"
+        raise VirtualRoomError(
+            f"virtual.scanner.token_file: {settings.token_file}: cannot be read ({why})"
+        ) from None
+    if not token:
+        raise VirtualRoomError(f"virtual.scanner.token_file: {settings.token_file} is empty")
+    return token
 
 
 def read_request(http: httpx.Client, service_url: str) -> AcquisitionRequest | None:
@@ -38,8 +58,11 @@ def operate(
     stop: threading.Event,
     note: Note,
     ready: Callable[[], None] = lambda: None,
+    token: str = "",
 ) -> None:
     """Play the scanner and its operator until `stop` is set; `ready` is called once it begins.
+
+    token: of the service, where it asks for one.
 
     Raises VirtualRoomError if the room has no scanner or the truth file cannot be written.
     """
@@ -49,7 +72,11 @@ def operate(
     with contextlib.closing(TruthFile(Path(settings.truth_file))) as truth:
         report = _reporter(truth, note)
         say = _once_in_a_row(note)
-        with httpx.Client(timeout=2.0, trust_env=False) as http, Outbox(settings, report) as outbox:
+        headers = {"Authorization": f"Bearer {token}"} if token else {}
+        with (
+            httpx.Client(timeout=2.0, trust_env=False, headers=headers) as http,
+            Outbox(settings, report) as outbox,
+        ):
             scanner = VirtualScanner(room, truth, outbox, say)
             ready()
             served: set[str] = set()

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from service.kinematics import Line
 from simulator.config import Fiducial, Placement, VirtualRoom
 
 Floats = NDArray[np.float64]
@@ -78,3 +79,17 @@ def true_fiducials_mm(room: VirtualRoom, stage_mm: Mapping[str, float]) -> dict[
 def true_fiducial_mm(room: VirtualRoom, stage_mm: Mapping[str, float]) -> Floats:
     """Centre (3,) of the first fiducial in patient LPS mm."""
     return true_fiducials_mm(room, stage_mm)[room.fiducials[0].name]
+
+
+def true_guide(room: VirtualRoom, stage_mm: Mapping[str, float]) -> Line:
+    """The guide's line in patient LPS mm, its point the lower ball joint, upwards.
+
+    For rooms whose fiducials are on the guide: of the first two, the one further along is above.
+    """
+    above, below = sorted(
+        (one for one in room.fiducials if one.mount == "guide"),
+        key=lambda one: -one.along_guide_mm,
+    )[:2]
+    places = true_fiducials_mm(room, stage_mm)
+    line = Line.through(places[below.name], places[above.name])
+    return Line(line.at(-below.along_guide_mm), line.direction)

@@ -1,8 +1,9 @@
 """Which round objects are in a frame: candidates for the fit, none where there is none.
 
 Matched filters find candidates at every radius of the range, large radii on a coarser copy of the
-frame; a candidate must then explain what is under its edge, stand out from the noise, and have its
-edge in all directions.
+frame; a candidate must then explain what is under its edge, stand out from the noise and from the
+grey levels' own steps, be large enough to show a shape, and have its edge in all directions, on a
+circle.
 """
 
 from dataclasses import dataclass
@@ -13,7 +14,8 @@ from numpy.typing import ArrayLike, NDArray
 from sr_engine.checks import checked_frames, checked_radii
 from sr_engine.errors import ParameterError, ShapeError
 from sr_engine.match import Match, best_matches, correlate, radius_grid
-from sr_engine.roundness import REACH_PX, refine_circle, roundness
+from sr_engine.resolution import LEAST_RADIUS_PX, grey_step, radius_seen_px
+from sr_engine.roundness import REACH_PX, out_of_round_px, refine_circle, roundness
 
 Array = NDArray[np.float64]
 
@@ -25,6 +27,9 @@ LEAST_SIGNIFICANCE = 100.0
 LEAST_COVERAGE = 0.8
 LEAST_SHARPNESS = 0.08  # of the edge's profile, not explained by a straight slope
 LEAST_CONTRAST = 4.0  # of the edge, over the noise of a sector of it
+LEAST_GREY_STEPS = 4.0  # of the edge: the corners of one or two levels are round by chance
+MOST_OUT_OF_ROUND_PX, MOST_OUT_OF_ROUND = 0.4, 0.02  # px, or of the radius if that is more
+_MAY_BE_A_SPOT_PX = 3.0  # radii of templates up to which an unresolved spot may match
 _OCTAVE_PX = 24.0  # radii above are looked for on a frame of half the size
 _CANDIDATES_PER_OBJECT = 3
 
@@ -54,7 +59,8 @@ def detect(
 ) -> list[Candidate]:
     """All round objects of a frame (rows, cols), strongest first; an empty list where none is.
 
-    radius_px: (low, high) or one number within 25 %; default 2 to 40 px.
+    radius_px: (low, high) or one number within 25 %; default 2 to 40 px. What is smaller than
+    1.5 px is not resolved, so that its shape cannot be told: it is never offered.
     roi: (row0, col0, row1, col1), centres are looked for in row0 <= row < row1 and likewise.
     An object may be brighter or darker than what surrounds it, or have only a wall.
     Objects inside of larger ones (vials in a phantom) are found beside them.
@@ -63,21 +69,31 @@ def detect(
     image = checked_frames(frame)[0]
     if max_objects < 1:
         raise ParameterError(f"max_objects must be at least 1, is {max_objects}")
-    radii = checked_radii(radius_px) or DEFAULT_RADII_PX
+    radii = _resolvable(checked_radii(radius_px) or DEFAULT_RADII_PX)
     bounds = checked_roi(roi, (image.shape[0], image.shape[1]))
     matches: list[Match] = []
     for scale, low, high in _octaves(radii, image.shape):
         matches += _matches_at_scale(image, scale, (low, high), max_objects)
     matches.sort(key=lambda m: -m.explained)
+    least_contrast = LEAST_GREY_STEPS * grey_step(image)
     found: list[Candidate] = []
     for match in matches:
         if not _within(match.centre_px, bounds) or _is_known(match, found):
             continue
-        candidate = _verified(image, match)
+        candidate = _verified(image, match, least_contrast)
         if candidate is not None:
             found.append(candidate)
     found.sort(key=lambda c: -c.strength)
     return found[:max_objects]
+
+
+def _resolvable(radii: tuple[float, float]) -> tuple[float, float]:
+    if radii[1] <= LEAST_RADIUS_PX:
+        raise ParameterError(
+            f"round objects of radius {radii[0]:.2f} to {radii[1]:.2f} px cannot be told from "
+            f"other spots; the shape shows from {LEAST_RADIUS_PX:g} px on"
+        )
+    return max(radii[0], LEAST_RADIUS_PX), radii[1]
 
 
 def checked_roi(
@@ -164,7 +180,7 @@ def _is_known(match: Match, found: list[Candidate]) -> bool:
     return False
 
 
-def _verified(image: Array, match: Match) -> Candidate | None:
+def _verified(image: Array, match: Match, least_contrast: float) -> Candidate | None:
     """The candidate with its circle drawn through its edge, if that is round and sharp."""
     centre, radius = match.centre_px, match.radius_px
     if radius > _OCTAVE_PX / 2:  # smaller ones are placed well enough by the filter
@@ -180,8 +196,14 @@ def _verified(image: Array, match: Match) -> Candidate | None:
         seen.coverage >= LEAST_COVERAGE
         and seen.sharpness >= LEAST_SHARPNESS
         and seen.contrast > LEAST_CONTRAST * seen.noise
+        and seen.contrast >= least_contrast
     )
     if not (real and inside):
+        return None
+    if radius < _MAY_BE_A_SPOT_PX and radius_seen_px(image, centre) < LEAST_RADIUS_PX:
+        return None
+    allowed_px = max(MOST_OUT_OF_ROUND_PX, MOST_OUT_OF_ROUND * radius)
+    if out_of_round_px(image, centre, radius) > allowed_px:
         return None
     strength = match.explained * seen.coverage
     return Candidate(centre, radius, strength, seen.coverage, seen.sharpness, seen.contrast)

@@ -115,8 +115,9 @@ class CameraImaging:
     camera: Camera = field(default_factory=Camera)
     frame_s: float = 27.6
     # what comes nearest to the camera's pixel and the interpolation together, and what it misses
+    # (at SNR 10 to 30; the reported covariance is then honest)
     psf: Psf | None = field(default_factory=lambda: Psf("gaussian", (0.3,)))
-    model_sigma_px: float = 0.022
+    model_sigma_px: float = 0.010
 
     def look(
         self,

@@ -48,6 +48,10 @@ export async function get(path) {
   return (await request("GET", path)).json();
 }
 
+export async function getText(path) {
+  return (await request("GET", path)).text();
+}
+
 export async function getPixels(path) {
   const answer = await request("GET", path);
   const values = new Float32Array(await answer.arrayBuffer());

@@ -36,7 +36,15 @@ export function drawHead(state, connected) {
   drawLights({ page: connected, robot: { linked: state.robot.linked, boot_id: state.robot.boot_id, problem: state.robot.problem }, processes: state.processes });
   setText(byId("room"), state.case?.label ? `${state.room} · ${state.case.label}` : state.room);
   setHidden(byId("banner-virtual"), !state.virtual);
+  drawEmergency(state.robot.linked && state.robot.phase === "EMERGENCY");
   document.title = `${state.ready ? "READY" : plain(state.robot.phase)} · AutoSPINe Navigator`;
+}
+
+function drawEmergency(isOn) {
+  const banner = byId("banner-emergency");
+  setHidden(banner, !isOn);
+  document.body.classList.toggle("emergency", isOn);
+  setText(banner, isOn ? "EMERGENCY: the robot is stopped and its drives are parked, without power. See to the patient and the needle first. Only Re-arm leaves this; measure again before any move, for parking shifts the stages a little." : "");
 }
 
 export function showLost(seconds) {

@@ -74,7 +74,7 @@ export class Images {
     if (state.slice) this.loadSlice({ id: state.slice.slice_id });
     const measured = state.measurement;
     if (state.reconstruction) this.loadSr({ id: state.reconstruction.measurement_id });
-    this.drawOverlay([state.slice, measured, state.target_patient_mm, state.entry_patient_mm, state.error, state.question?.plan, state.tolerance_mm, this.picked]);
+    this.drawOverlay([state.slice, measured, state.target_patient_mm, state.entry_patient_mm, state.error, state.question?.plan, state.tolerance_mm, this.picked, state.other_fiducial, state.arrival]);
     this.tickAge();
   }
 
@@ -211,12 +211,30 @@ export class Images {
           s("circle", { cx: x + dCol, cy: y + dRow, r: found.radius_mm ?? 4, class: "thin c-plan dash" }));
       }
     }
+    parts.push(...this.guide(at, found));
     if (target) parts.push(...mark(at(target), "c-target", tolerance));
     if (entry) {
       parts.push(...mark(at(entry), "c-entry", 0.8));
       if (target) parts.push(s("line", { x1: at(entry)[0], y1: at(entry)[1], x2: at(target)[0], y2: at(target)[1], class: "thin c-entry dash" }));
     }
     if (this.picked) parts.push(...mark(at(this.picked), "c-plan dash", 1));
+    return parts;
+  }
+
+  // Two fiducials: the other one as it was seen in its own slice, the guide's axis through both, and
+  // at READY the needle from the lower ball joint to its tip; all projected onto this slice.
+  guide(at, found) {
+    const { other_fiducial: other, arrival } = this.state;
+    const parts = [];
+    if (other && found?.patient_mm) {
+      const [[x, y], [x0, y0]] = [at(other.patient_mm), at(found.patient_mm)];
+      parts.push(s("line", { x1: x0, y1: y0, x2: x, y2: y, class: "thin c-fiducial dash guide-axis" }),
+        s("circle", { cx: x, cy: y, r: other.radius_mm, class: "thin c-fiducial dash other-fiducial" }), cross(x, y, 0.7, "c-fiducial"));
+    }
+    if (arrival?.tip_mm && arrival.joint_mm) {
+      const [[x, y], [x0, y0]] = [at(arrival.tip_mm), at(arrival.joint_mm)];
+      parts.push(s("line", { x1: x0, y1: y0, x2: x, y2: y, class: "thin c-plan needle" }), cross(x, y, 1.2, "c-plan"));
+    }
     return parts;
   }
 

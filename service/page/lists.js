@@ -69,16 +69,27 @@ export const drawCase = whenChanged(({ description, case_uid, role }) => {
   input("label", "Name of the case", description?.label), input("operator", "Operator", description?.operator),
   input("note", "Note", description?.note),
   h("button", { disabled: role !== "operator" }, "Save"));
-  replace(byId("case"), form, h("p", { class: "quiet" }, `Case ${case_uid || "not begun"}. No patient's name here: the record is exported as it is.`));
+  const papers = h("p", { class: "papers" },
+    h("a", { href: "/api/v1/report", target: "_blank", rel: "noopener" }, "Report of this case"),
+    h("a", { href: "/api/v1/export", download: "" }, "Export it as a zip"));
+  replace(byId("case"), form, papers, h("p", { class: "quiet" }, `Case ${case_uid || "not begun"}. No patient's name here: the record is exported as it is.`));
 });
+
+function papersOf(folder) {
+  const of = `?case=${encodeURIComponent(folder)}`;
+  return [
+    h("a", { href: `/api/v1/report${of}`, target: "_blank", rel: "noopener", "aria-label": `Report of ${folder}` }, "report"),
+    h("a", { href: `/api/v1/export${of}`, download: "", "aria-label": `Export of ${folder}` }, "zip"),
+  ];
+}
 
 export async function drawPast() {
   const cases = await get("/api/v1/cases");
-  const table = h("table", {}, h("thead", {}, h("tr", {}, ["Case", "Begun", "Slices", "Measurements", "Punctures"].map((name) => h("th", { scope: "col" }, name)))),
+  const table = h("table", {}, h("thead", {}, h("tr", {}, ["Case", "Begun", "Slices", "Measurements", "Punctures", "To take along"].map((name) => h("th", { scope: "col" }, name)))),
     h("tbody", {}, cases.map((one) => h("tr", {},
       h("td", { class: "left" }, one.current ? h("b", {}, one.label || one.folder) : one.label || one.folder),
       h("td", { class: "left" }, one.created_s ? day(one.created_s) : ""),
-      h("td", {}, String(one.slices)), h("td", {}, String(one.measurements)), h("td", {}, String(one.punctures))))));
+      h("td", {}, String(one.slices)), h("td", {}, String(one.measurements)), h("td", {}, String(one.punctures)), h("td", { class: "papers" }, papersOf(one.folder))))));
   replace(byId("past"), cases.length ? table : h("p", { class: "quiet" }, "None."));
 }
 

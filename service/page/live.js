@@ -6,8 +6,8 @@ const SILENT_MS = 2500;
 const OLD_S = 3;
 
 export class Live {
-  constructor({ onState, onEvent, onUp, onDown }) {
-    this.on = { onState, onEvent, onUp, onDown };
+  constructor({ onState, onEvent, onUp, onDown, onClock }) {
+    this.on = { onState, onEvent, onUp, onDown, onClock };
     this.lastId = 0;
     this.heardMs = performance.now();
     this.isUp = false;
@@ -27,6 +27,7 @@ export class Live {
     }));
     source.addEventListener("beat", (message) => {
       const { at_s: atS, now_s: nowS } = JSON.parse(message.data);
+      this.on.onClock(nowS);
       if (nowS - atS > OLD_S) this.lost(nowS - atS);
       else this.heard(() => {});
     });

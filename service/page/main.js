@@ -9,6 +9,8 @@ import { addEvent, drawAlarms, drawAside, drawCase, drawJog, drawPast } from "./
 import { Live } from "./live.js";
 import { askForToken, leave, whoAmI } from "./login.js";
 import { act, Next } from "./next.js";
+import { drawParts, keepCounting } from "./parts.js";
+import { drawScannerClock, heardFromRoom } from "./scanner_clock.js";
 import { drawNumbers } from "./numbers.js";
 import { drawStages } from "./stage_map.js";
 
@@ -28,6 +30,8 @@ function draw(state) {
   drawAlarms(state.alarms ?? []);
   drawJog({ positions_um: robot.positions_um, possible: page.role === "operator" && state.jog_possible });
   drawCase({ description: state.case, case_uid: state.case_uid, role: page.role });
+  drawScannerClock({ clock: state.clock, role: page.role });
+  drawParts({ robot: { linked: robot.linked, boot_id: robot.boot_id, problem: robot.problem }, processes: state.processes, slices: state.slices });
   newAside([state.slices.quarantined, state.hold?.hold_id, page.role]);
   newPast([state.procedure, state.punctured, state.case]);
   newMeasurements([state.measurement?.measurement_id, state.measurement?.state, state.target_patient_mm]);
@@ -44,10 +48,10 @@ async function loadMeasurements() {
   drawHistory({ measurements: page.measurements, toleranceMm: page.state.tolerance_mm });
 }
 
-async function pressStop() {
+async function pressStop(emergency = false) {
   const button = byId("stop");
   try {
-    await stopRobot();
+    await stopRobot(emergency);
     button.classList.add("sent");
     setTimeout(() => button.classList.remove("sent"), 3000);
     setText(byId("refusal"), "");
@@ -57,8 +61,9 @@ async function pressStop() {
 }
 
 const live = new Live({
-  onState: draw,
+  onState: (state) => { heardFromRoom(state.at_s); draw(state); },
   onEvent: addEvent,
+  onClock: heardFromRoom,
   onUp: () => { page.connected = true; showUp(); },
   onDown: async (seconds, failures) => {
     page.connected = false;
@@ -83,9 +88,11 @@ async function begin() {
   byId("events").replaceChildren();
   events.reverse().forEach(addEvent);
   live.open(events.at(-1)?.event_id ?? 0);
+  keepCounting();
 }
 
-byId("stop").onclick = pressStop;
+byId("stop").onclick = () => pressStop();
+byId("emergency").onclick = () => pressStop(true);
 byId("leave").onclick = () => act(leave);
 // STOP from anywhere on the page, whatever has the focus, before anything else sees the key.
 addEventListener("keydown", (event) => {

@@ -51,7 +51,7 @@ export const drawNumbers = whenChanged(({ error, measurement, tolerance_mm, arri
         h("p", { class: `big ${inside ? "inside" : "outside"}` }, mm(shown.error_mm, shown.error_mm < 10 ? 3 : 2), h("small", {}, " mm")),
         h("p", { class: "pm" }, `± ${mm(shown.sigma_mm, 3)} mm`, h("span", { class: "quiet" }, " (1 σ)"))),
       closeUp(error, tolerance_mm, measurement?.covariance_mm2)),
-    h("p", { class: "quiet" }, slice ? `The target lies ${inWords(slice, error.row_mm, error.col_mm, 3)}.` : ""),
+    h("p", { class: "quiet" }, slice ? `${arrival ? "By the newest slices alone the target lies" : "The target lies"} ${inWords(slice, error.row_mm, error.col_mm, 3)}.` : ""),
     h("table", {}, h("tbody", {},
       row(`Within ${mm(tolerance_mm, 3)} mm`, percent(chance), "probability that the true error is below the tolerance"),
       ...rows)));

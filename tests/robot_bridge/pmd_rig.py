@@ -140,12 +140,12 @@ def opened(made: Rig, drive: str = "open_loop", declare: bool = True, **changes:
         motors.close()
 
 
-def finish(motors: PmdMotors, within_s: float = 10.0) -> MotorStatus:
+def finish(motors: PmdMotors, within_s: float = 60.0) -> MotorStatus:
     """Poll until the motion has ended."""
     return wait_until(motors, lambda status: not status.moving, within_s)
 
 
-def wait_until(motors: PmdMotors, wanted, within_s: float = 5.0) -> MotorStatus:
+def wait_until(motors: PmdMotors, wanted, within_s: float = 60.0) -> MotorStatus:
     deadline_s = time.monotonic() + within_s
     while True:
         status = motors.poll()

@@ -150,7 +150,7 @@ def test_capture_writes_the_bytes_of_both_directions(tmp_path: Path):
 def test_status_reads_the_daemons_own_report_without_a_session(shared_room: BridgeRoom):
     room = shared_room
     client = room.ready_client()
-    wait_for(lambda: client.pump(0.05) or room.status_file()["armed"], 5, "the report")
+    wait_for(lambda: client.pump(0.05) or room.status_file()["armed"], 60, "the report")
     command = [sys.executable, "-m", "robot_bridge.command_line", "--config"]
     command += [str(room.config_file), "--json", "status"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60)

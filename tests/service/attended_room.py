@@ -21,10 +21,13 @@ Seen = TypeVar("Seen")
 
 
 class AttendedRoom(DemoRoom):
-    """The demo's room, but it asks before every approach move; `more` ends its file."""
+    """The demo's room, but it asks before every approach move; `more` ends its file.
 
-    def __init__(self, folder: Path, more: str = "") -> None:
-        super().__init__(DemoOptions(folder, seed=3, speed_factor=1.5))
+    tokens: it asks whoever comes for a token, the scanner too; `operator_token` is the operator's.
+    """
+
+    def __init__(self, folder: Path, more: str = "", *, tokens: bool = False) -> None:
+        super().__init__(DemoOptions(folder, seed=3, speed_factor=1.5, tokens=tokens))
         self._more = more
 
     def _write_config(self, ports: tuple[int, int]) -> Path:
@@ -58,8 +61,8 @@ class AttendedRoom(DemoRoom):
 
 
 @contextmanager
-def running_room(folder: Path, more: str = "") -> Iterator[AttendedRoom]:
-    room = AttendedRoom(folder, more)
+def running_room(folder: Path, more: str = "", *, tokens: bool = False) -> Iterator[AttendedRoom]:
+    room = AttendedRoom(folder, more, tokens=tokens)
     try:
         room.start()
         yield room

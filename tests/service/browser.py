@@ -6,9 +6,10 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from playwright.sync_api import Browser, Page, sync_playwright
+from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 CHROMIUM = Path("/usr/bin/chromium")
+_PATIENCE_MS = 60_000.0
 _OPTIONS = [
     "--no-sandbox",
     "--disable-gpu",
@@ -22,12 +23,21 @@ _OPTIONS = [
 
 @contextmanager
 def running_browser() -> Iterator[Browser]:
+    expect.set_options(timeout=_PATIENCE_MS)
     with sync_playwright() as playwright:
         browser = playwright.chromium.launch(executable_path=str(CHROMIUM), args=_OPTIONS)
         try:
             yield browser
         finally:
             browser.close()
+
+
+def laid_out(page: Page) -> None:
+    """Until what was changed has its place on the screen: observers of sizes act a frame later."""
+    page.evaluate(
+        """() => new Promise((done) => requestAnimationFrame(
+            () => requestAnimationFrame(() => requestAnimationFrame(done))))"""
+    )
 
 
 class Complaints(list[str]):

@@ -4,13 +4,17 @@ from collections.abc import Callable, Iterator
 
 import pytest
 from attended_room import AttendedRoom, running_room
+from browser import CHROMIUM, Complaints, running_browser
 from offline_arguments import calibration_arguments
+from playwright.sync_api import Browser, Page, expect
 
 from service.calibration import Calibration, calibrate
 from service.client import RoomClient
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
 from studies.offline_room import MrImaging, OfflineRoom
+
+_PATIENCE_MS = 60_000
 
 
 @pytest.fixture
@@ -38,3 +42,25 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AttendedRoom]:
 def client(room: AttendedRoom) -> Iterator[RoomClient]:
     with RoomClient(room.url, by="tester") as talking:
         yield talking
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Browser]:
+    if not CHROMIUM.exists():
+        pytest.skip(f"needs the system's Chromium ({CHROMIUM})")
+    expect.set_options(timeout=_PATIENCE_MS)
+    with running_browser() as running:
+        yield running
+
+
+@pytest.fixture
+def page(browser: Browser, room: AttendedRoom) -> Iterator[Page]:
+    complaints = Complaints()
+    page = browser.new_page(viewport={"width": 1280, "height": 800})
+    complaints.watch(page)
+    page.set_default_timeout(_PATIENCE_MS)
+    page.goto(room.url)
+    expect(page.locator("#phases [aria-current]")).to_be_visible()
+    yield page
+    page.close()
+    assert not complaints

@@ -20,7 +20,7 @@ from service.children import autospine
 OPERATOR, VIEWER, EXPIRED = new_token(), new_token(), new_token()
 TOKENS = f"""
 lock_out_after = 3
-lock_out_s = 2.0
+lock_out_s = 5.0
 
 [[service.token]]
 name = "Olga"
@@ -152,14 +152,14 @@ def test_wrong_tokens_lock_an_address_out_but_not_its_sessions_and_not_stop(url:
             check_problem(wrong, 401, "unauthorized")
         locked = httpx.get(f"{url}/api/v1/state", headers=bearer(OPERATOR))
         check_problem(locked, 429, "locked_out")
-        assert 1 <= int(locked.headers["retry-after"]) <= 3
+        assert 1 <= int(locked.headers["retry-after"]) <= 6
         answer = httpx.post(f"{url}/api/v1/session", json={"token": OPERATOR})
         check_problem(answer, 429, "locked_out")
         assert browser.get("/api/v1/state").status_code == 200
         assert httpx.post(f"{url}/api/v1/stop", headers=bearer(OPERATOR)).status_code == 202
         wait_s = int(locked.headers["retry-after"])
-    deadline = httpx.get(f"{url}/healthz").elapsed.total_seconds() + wait_s + 1
-    assert until_let_in(url, deadline)
+    time.sleep(wait_s)
+    assert until_let_in(url, patience_s=60.0)
 
 
 def until_let_in(url: str, patience_s: float) -> bool:
@@ -223,7 +223,8 @@ def test_with_certificate_and_key_the_page_is_served_over_https(tmp_path: Path) 
     issued.private_key_pem.write_to_path(tmp_path / "key.pem")
     issued.cert_chain_pems[0].write_to_path(tmp_path / "certificate.pem")
     authority.cert_pem.write_to_path(tmp_path / "authority.pem")
-    tls = f'tls_certificate = "{tmp_path}/certificate.pem"\ntls_key = "{tmp_path}/key.pem"\n'
+    # relative to the configuration file, wherever the service was started
+    tls = 'tls_certificate = "certificate.pem"\ntls_key = "key.pem"\n'
     with running_service(tmp_path, tls + TOKENS) as url:
         assert url.startswith("https://")
         trusting = ssl.create_default_context(cafile=str(tmp_path / "authority.pem"))

@@ -24,7 +24,9 @@ from service.procedures import (
 from service.procedures import (
     calibration_arguments as calibration_json,
 )
+from service.replay import replay_measurements
 from service.sensing import ProcedureFailedError
+from service.steps import Acquire
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
 from sr_engine.shiftset import named
@@ -187,3 +189,14 @@ def test_replay_refuses_a_method_that_does_not_exist(case):
         2,
         "autospine: no method 'magic'; known: ml, base, bicubic, sr",
     )
+
+
+def test_a_measurement_is_replayed_from_the_slices_that_were_there_then(tmp_path):
+    """More slices of the same hold came later: they are not in the measurement."""
+    with CaseRecord(tmp_path, create=True) as record:
+        room = RecordedRoom(record, MrImaging(VirtualRoom()), StageParameters(), 6)
+        room.run_recorded(CALIBRATION, calibration_json(calibration_arguments()))
+        room.execute(Acquire(4))
+        again = list(replay_measurements(record, None))
+    assert [row.frames for row in again] == [1, 1, 1, 1]
+    assert all(row.difference_mm == 0.0 for row in again)

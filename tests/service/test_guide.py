@@ -7,17 +7,17 @@ import numpy as np
 import pytest
 
 from case_record.record import CaseRecord
-from service.guide import (
-    REJECT,
-    GuideArguments,
-    GuideCalibration,
+from service.approach import REJECT
+from service.calibration import Calibration
+from service.guide_approach import GuideApproachArguments, approach_guide
+from service.guide_calibration import GuideCalibrationArguments, calibrate_guide
+from service.guide_geometry import (
     GuideGeometry,
-    approach_guide,
-    calibrate_guide,
+    GuideSeenWrongError,
+    line_of_state,
     state_on_line,
     tip_of,
 )
-from service.kinematics import Line
 from service.procedures import (
     GUIDE_APPROACH,
     GUIDE_CALIBRATION,
@@ -29,6 +29,7 @@ from service.sensing import ProcedureFailedError
 from simulator.config import Fiducial, VirtualRoom
 from simulator.mr_slice import slice_geometry
 from simulator.scene import true_fiducials_mm
+from simulator.scene import true_guide as line_of_room
 from simulator.stage_physics import StageParameters
 from studies.offline_room import MrImaging, OfflineRoom, plane_of
 from studies.recorded_room import RecordedRoom
@@ -45,19 +46,37 @@ GEOMETRY = GuideGeometry(UPPER, LOWER, APART, (58.0 - APART + UPPER, 58.0 - APAR
 PLANE = plane_of(slice_geometry(ROOM.protocol))
 
 
-def arguments(**changes):
+GATES = {
+    "position_gate_mm": 3.0,
+    "gate_sigma": 5.0,
+    "repeatability_mm": 0.014,
+    "scale_error": 0.015,
+}
+LOWER_PLANE = 58.0 - APART
+
+
+def calibration_arguments(**changes):
     values = {
         "axes": AXES,
         "origin_um": dict.fromkeys(AXES, 0),
         "move_um": 6000,
         "geometry": GEOMETRY,
-        "travel_um": dict.fromkeys(AXES, (-20_000, 20_000)),
-        "position_gate_mm": 3.0,
-        "gate_sigma": 5.0,
-        "repeatability_mm": 0.014,
-        "scale_error": 0.015,
     }
-    return GuideArguments(**{**values, **changes})
+    return GuideCalibrationArguments(**{**values, **GATES, **changes})
+
+
+def approach_arguments(target_mm, **changes):
+    values = {
+        "geometry": GEOMETRY,
+        "lower_plane_mm": LOWER_PLANE,
+        "target_mm": tuple(float(value) for value in target_mm),
+        "travel_um": dict.fromkeys(AXES, (-20_000, 20_000)),
+        "tolerance_mm": 0.25,
+        "confidence": 0.95,
+        "max_iterations": 8,
+        "confirm_moves": True,
+    }
+    return GuideApproachArguments(**{**values, **GATES, **changes})
 
 
 def make_room(seed, room=ROOM, **options):
@@ -66,9 +85,7 @@ def make_room(seed, room=ROOM, **options):
 
 def true_guide(room):
     """Line of the guide (point: lower joint) in patient mm."""
-    centres = true_fiducials_mm(ROOM, room.stage_mm)
-    line = Line.through(centres["lower"], centres["upper"])
-    return Line(line.at(-LOWER), line.direction)
+    return line_of_room(ROOM, room.stage_mm)
 
 
 def true_tip(room):
@@ -83,14 +100,14 @@ def true_state(room):
 @pytest.fixture(scope="module")
 def recorded():
     room = make_room(0)
-    return room.run(calibrate_guide(arguments())).to_json()
+    return room.run(calibrate_guide(calibration_arguments())).to_json()
 
 
 @pytest.fixture
 def calibrated(recorded):
     """The same room again, as it stands after its calibration."""
     room = make_room(0)
-    return room, room.run(calibrate_guide(arguments()))
+    return room, room.run(calibrate_guide(calibration_arguments()))
 
 
 def test_the_tip_is_linear_in_what_is_seen():
@@ -110,21 +127,34 @@ def test_the_state_of_a_guide_on_a_given_line_is_what_would_be_seen():
     assert state == pytest.approx(true_state(room), abs=1e-9)
 
 
+def test_the_line_of_a_state_is_the_guides_true_line():
+    room = make_room(0)
+    for axis, value in zip(AXES, (5.0, -3.0, 1.0, 8.0), strict=True):
+        room.stages[axis].displace(1000.0 * value)
+    true = true_guide(room)
+    found = line_of_state(GEOMETRY, true_state(room), PLANE, float(true.point_mm[1]))
+    assert found.point_mm == pytest.approx(true.point_mm, abs=1e-9)
+    assert found.direction == pytest.approx(true.direction, abs=1e-9)
+
+
+def test_fiducials_further_apart_than_on_the_guide_are_refused():
+    with pytest.raises(GuideSeenWrongError, match=r"34\.0 mm between them cannot"):
+        line_of_state(GEOMETRY, np.array([40.0, 0.0, 0.0, 0.0]), PLANE, LOWER_PLANE)
+
+
 def test_the_tip_80_mm_below_the_lower_plane_is_as_wrong_as_its_covariance_says():
     """30 approaches: honest covariance at the tip, and most tips within the tolerance."""
     normalised, errors, frames = [], [], []
     for seed in range(5):
         room = make_room(seed)
-        calibration = room.run(calibrate_guide(arguments()))
+        calibration = room.run(calibrate_guide(calibration_arguments()))
         home = calibration.estimate.plane_mm
         rng = np.random.default_rng(seed)
         for _ in range(6):
             target = home + rng.uniform(-3.0, 3.0, 4)
             wanted = GEOMETRY.tip_from_fiducials @ target
             before = room.frames
-            arrival = room.run(
-                approach_guide(arguments(target_mm=tuple(target.tolist())), calibration)
-            )
+            arrival = room.run(approach_guide(approach_arguments(target), calibration))
             calibration = arrival.calibration
             tip, covariance = tip_of(GEOMETRY, calibration.estimate)
             miss = true_tip(room) - tip
@@ -161,9 +191,9 @@ def test_fiducials_above_the_top_plane_work_as_well():
     geometry = GuideGeometry(*along, APART, (58.0 - APART + along[0], 58.0 - APART + along[1]))
     room = make_room(1, room_model)
     # the levers are long: stay within the field of view and near the vertical
-    calibration = room.run(calibrate_guide(arguments(geometry=geometry, move_um=4000)))
+    calibration = room.run(calibrate_guide(calibration_arguments(geometry=geometry, move_um=4000)))
     target = calibration.estimate.plane_mm + np.array([1.0, -2.0, 0.5, 0.5])
-    changed = arguments(geometry=geometry, target_mm=tuple(target.tolist()))
+    changed = approach_arguments(target, geometry=geometry)
     arrival = room.run(approach_guide(changed, calibration))
     assert arrival.probability >= 0.95
     assert np.linalg.norm(arrival.tip_error_mm) < 0.25
@@ -173,7 +203,7 @@ def test_swapped_fiducials_are_noticed_in_the_calibration():
     swapped = replace(GEOMETRY, slice_positions_mm=GEOMETRY.slice_positions_mm[::-1])
     room = make_room(0)
     with pytest.raises(ProcedureFailedError, match="taken for each other") as failure:
-        room.run(calibrate_guide(arguments(geometry=swapped)))
+        room.run(calibrate_guide(calibration_arguments(geometry=swapped)))
     assert failure.value.code == "fiducials_swapped"
     assert len(room.moves) == 5  # and not moved any further
 
@@ -183,9 +213,9 @@ def test_fiducials_swapped_after_the_calibration_stop_the_approach(calibrated):
     swapped = replace(GEOMETRY, slice_positions_mm=GEOMETRY.slice_positions_mm[::-1])
     room.stages["xt"].displace(9000.0)  # the guide leans: the two are not above each other
     moves = len(room.moves)
-    target = tuple((calibration.estimate.plane_mm + 1.0).tolist())
+    target = calibration.estimate.plane_mm + 1.0
     with pytest.raises(ProcedureFailedError):
-        room.run(approach_guide(arguments(geometry=swapped, target_mm=target), calibration))
+        room.run(approach_guide(approach_arguments(target, geometry=swapped), calibration))
     assert len(room.moves) <= moves + 1
 
 
@@ -193,9 +223,9 @@ def test_a_lost_fiducial_is_said_so(calibrated):
     room, calibration = calibrated
     room.imaging = MrImaging(VirtualRoom(fiducials=(ROOM.fiducials[0],), background=()))
     moves = len(room.moves)
-    target = tuple((calibration.estimate.plane_mm + 1.0).tolist())
+    target = calibration.estimate.plane_mm + 1.0
     with pytest.raises(ProcedureFailedError, match="no usable measurement"):
-        room.run(approach_guide(arguments(target_mm=target), calibration))
+        room.run(approach_guide(approach_arguments(target), calibration))
     assert len(room.moves) == moves + 1
 
 
@@ -203,15 +233,15 @@ def test_an_axis_that_does_not_move_is_named():
     room = make_room(0)
     room.stages["xb"].apply_load(1.05)  # beyond what the motor can push
     with pytest.raises(ProcedureFailedError, match=r"axis xb: .* moved 0\.00 mm per mm"):
-        room.run(calibrate_guide(arguments()))
+        room.run(calibrate_guide(calibration_arguments()))
 
 
 def test_a_line_out_of_reach_moves_nothing(calibrated):
     room, calibration = calibrated
     moves = len(room.moves)
-    target = tuple((calibration.estimate.plane_mm + np.array([0.0, 30.0, 0.0, 0.0])).tolist())
+    target = calibration.estimate.plane_mm + np.array([0.0, 30.0, 0.0, 0.0])
     with pytest.raises(ProcedureFailedError, match="outside its travel"):
-        room.run(approach_guide(arguments(target_mm=target), calibration))
+        room.run(approach_guide(approach_arguments(target), calibration))
     assert len(room.moves) == moves
 
 
@@ -219,14 +249,14 @@ def test_a_rejected_move_is_not_made(calibrated):
     _, calibration = calibrated
     room = make_room(0, answer=lambda _: REJECT)
     room.setpoints_um = dict(calibration.estimate.setpoints_um)
-    target = tuple((calibration.estimate.plane_mm + 1.0).tolist())
+    target = calibration.estimate.plane_mm + 1.0
     with pytest.raises(ProcedureFailedError, match="rejected by operator"):
-        room.run(approach_guide(arguments(target_mm=target), calibration))
+        room.run(approach_guide(approach_arguments(target), calibration))
     assert room.moves == []
 
 
 def test_a_calibration_survives_its_json_form(recorded):
-    again = GuideCalibration.from_json(json.loads(json.dumps(recorded)))
+    again = Calibration.from_json(json.loads(json.dumps(recorded)))
     assert again.to_json() == recorded
 
 
@@ -240,11 +270,11 @@ def test_a_recorded_case_of_four_axes_replays_to_the_last_bit(tmp_path):
     """Real DICOM files of two slice positions, the real worker, and the case's record."""
     with CaseRecord(tmp_path, create=True) as record:
         room = RecordedRoom(record, MrImaging(ROOM), StageParameters(), 3, axes=AXES)
-        calibration = room.run_recorded(GUIDE_CALIBRATION, guide_calibration_arguments(arguments()))
-        target = calibration.estimate.plane_mm + np.array([1.0, -1.5, 0.5, 1.0])
-        approached = guide_approach_arguments(
-            arguments(target_mm=tuple(target.tolist())), calibration
+        calibration = room.run_recorded(
+            GUIDE_CALIBRATION, guide_calibration_arguments(calibration_arguments())
         )
+        target = calibration.estimate.plane_mm + np.array([1.0, -1.5, 0.5, 1.0])
+        approached = guide_approach_arguments(approach_arguments(target), calibration)
         arrival = room.run_recorded(GUIDE_APPROACH, approached)
         wanted = GEOMETRY.tip_from_fiducials @ target
         assert np.linalg.norm(true_tip(room) - wanted) < 0.25

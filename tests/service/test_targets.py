@@ -3,19 +3,22 @@
 import numpy as np
 import pytest
 from offline_arguments import approach_arguments, calibration_arguments
-from test_guide import GEOMETRY, PLANE, arguments, make_room, true_guide
+from test_guide import APART, GEOMETRY, PLANE, make_room, true_guide
+from test_guide import approach_arguments as guide_arguments
+from test_guide import calibration_arguments as guide_calibration
 
 from case_record.record import CaseRecord
 from service.approach import approach
 from service.calibration import calibrate
-from service.guide import approach_guide, calibrate_guide
+from service.guide_approach import approach_guide
+from service.guide_calibration import calibrate_guide
 from service.targets import (
     Target,
     TargetError,
     all_targets,
     current_target,
     fiducial_must_appear_at,
-    guide_must_appear_at,
+    needle_line,
     oil_shift_mm,
 )
 from simulator.config import SliceProtocol, VirtualRoom
@@ -112,23 +115,29 @@ def test_a_fiducial_target_needs_no_header():
 
 def test_entry_and_target_are_met_by_the_needles_line():
     room = make_room(7)
-    calibration = room.run(calibrate_guide(arguments()))
+    calibration = room.run(calibrate_guide(guide_calibration()))
     joint_y = float(true_guide(room).point_mm[1])
     entry, target = (6.0, joint_y - 20.0, -19.0), (9.0, joint_y - 80.0, -22.0)
-    state = guide_must_appear_at(entry, target, GEOMETRY, PLANE, joint_y)
-    room.run(approach_guide(arguments(target_mm=tuple(state.tolist())), calibration))
+    needle = needle_line(entry, target, PLANE, joint_y, joint_y + APART)
+    assert needle.joint_mm - needle.depth_mm * needle.direction == pytest.approx(target)
+    state = needle.state(GEOMETRY, PLANE)
+    room.run(approach_guide(guide_arguments(state), calibration))
     line = true_guide(room)
     assert line.distance_to_mm(target) < 0.25
     assert line.distance_to_mm(entry) < 0.15
 
 
 @pytest.mark.parametrize(
-    ("entry", "said"),
-    [((9.0, -20.0, -22.0), "make no line"), ((40.0, -20.5, -22.0), "flatter than 30°")],
+    ("entry", "lower_plane_mm", "said"),
+    [
+        ((9.0, -20.0, -22.0), -2.0, "make no line"),
+        ((40.0, -20.5, -22.0), -2.0, "flatter than 30°"),
+        ((9.0, 10.0, -22.0), -30.0, r"10\.0 mm above the lower plane"),
+    ],
 )
-def test_an_entry_that_makes_no_needle_is_refused(entry, said):
+def test_an_entry_that_makes_no_needle_is_refused(entry, lower_plane_mm, said):
     with pytest.raises(TargetError, match=said):
-        guide_must_appear_at(entry, (9.0, -20.0, -22.0), GEOMETRY, PLANE, -2.0)
+        needle_line(entry, (9.0, -20.0, -22.0), PLANE, lower_plane_mm, lower_plane_mm + APART)
 
 
 def test_the_plane_of_the_room_is_coronal():

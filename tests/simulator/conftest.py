@@ -104,5 +104,5 @@ def start(tmp_path: Path, stages: Stages, page: Page, receiver: Receiver) -> Ite
     yield start
     stop.set()
     for thread in threads:
-        thread.join(timeout=15)
+        thread.join(timeout=60)
         assert not thread.is_alive(), "the scanner stops when it is told to"

@@ -76,7 +76,7 @@ class Receiver:
     arrived_at_s: list[float] = field(default_factory=list)
     statuses: list[int] = field(default_factory=list)
 
-    def wait_for(self, count: int, timeout_s: float = 15.0) -> list[Dataset]:
+    def wait_for(self, count: int, timeout_s: float = 60.0) -> list[Dataset]:
         deadline_s = time.monotonic() + timeout_s
         while len(self.arrived) < count:
             assert time.monotonic() < deadline_s, f"{len(self.arrived)} of {count} slices arrived"
@@ -118,7 +118,7 @@ class Running:
         return [line for line in lines if line["kind"] == kind]
 
     def wait_for_truth(self, count: int, kind: str = "acquisition") -> list[dict[str, Any]]:
-        deadline_s = time.monotonic() + 15
+        deadline_s = time.monotonic() + 60
         while len(self.truth(kind)) < count:
             assert time.monotonic() < deadline_s, f"{self.truth(kind)}, {self.notes}"
             time.sleep(0.01)

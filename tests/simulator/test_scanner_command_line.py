@@ -92,7 +92,7 @@ def test_the_process_says_where_its_truth_is_scans_and_ends_with_its_parent(
         receiver.wait_for(2)
         assert process.stdin is not None
         process.stdin.close()
-        assert process.wait(timeout=10) == 0
+        assert process.wait(timeout=60) == 0
         assert process.stderr is not None
         assert process.stderr.read() == b""
     truth = [json.loads(entry) for entry in Path(line["truth_file"]).read_text().splitlines()]
@@ -104,7 +104,7 @@ def test_a_signal_ends_the_process_cleanly(config: Path, number: signal.Signals)
     with scanner("--config", str(config)) as process:
         ready(process)
         os.kill(process.pid, number)
-        assert process.wait(timeout=10) == 0
+        assert process.wait(timeout=60) == 0
         assert process.stderr is not None
         assert process.stderr.read() == b""
 
@@ -137,7 +137,7 @@ def test_a_bad_configuration_is_one_line_that_names_file_and_key(
 
 def test_the_process_ends_with_code_2_and_one_line_on_bad_input(config: Path) -> None:
     with scanner("--config", str(config.parent / "absent.toml")) as process:
-        assert process.wait(timeout=20) == 2
+        assert process.wait(timeout=60) == 2
         assert process.stdout is not None
         assert process.stderr is not None
         assert process.stdout.read() == b""
@@ -215,6 +215,6 @@ def test_a_listener_that_is_not_there_is_one_line_on_stderr_for_each_slice(
             assert process.stderr is not None
             lines = [json.loads(process.stderr.readline()) for _ in range(2)]
             process.terminate()
-            assert process.wait(timeout=10) == 0
+            assert process.wait(timeout=60) == 0
             assert process.stderr.read() == b""
     assert all("could not be delivered: no association" in line["note"] for line in lines)

@@ -41,7 +41,7 @@ def test_late_slices_come_seconds_after_their_reconstruction(
     page.ask_for("r1")
     (line,) = running.wait_for_truth(1)
     receiver.wait_for(1)
-    assert 1.9 < time.time() - line["ended_s"] < 5.0
+    assert time.time() - line["ended_s"] > 1.9
 
 
 def test_duplicates_are_the_same_bytes_under_the_same_uid(

@@ -274,7 +274,7 @@ def _distance_to_a_slice_of_a_standing_robot(
 
 
 def _wait_until_somebody_listens(port: int) -> None:
-    deadline_s = time.monotonic() + 10
+    deadline_s = time.monotonic() + 60
     while True:
         try:
             socket.create_connection(("127.0.0.1", port)).close()

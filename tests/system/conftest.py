@@ -76,7 +76,7 @@ class RunningDemo:
         self.seen.update(children_of(self.process.pid))
         return self.seen
 
-    def pid_of(self, part: str, timeout_s: float = 30.0) -> int:
+    def pid_of(self, part: str, timeout_s: float = 120.0) -> int:
         deadline_s = time.monotonic() + timeout_s
         while time.monotonic() < deadline_s:
             for pid, words in self.look().items():
@@ -85,7 +85,7 @@ class RunningDemo:
             time.sleep(0.1)
         raise AssertionError(f"no process {part!r} in {self.seen}")
 
-    def wait_for_event(self, kind: str, timeout_s: float = 60.0) -> None:
+    def wait_for_event(self, kind: str, timeout_s: float = 120.0) -> None:
         """Until the case record has an event of this kind."""
         from case_record.record import CaseRecord, CaseRecordError
 
@@ -102,11 +102,11 @@ class RunningDemo:
             time.sleep(0.1)
         raise AssertionError(f"no event {kind!r} within {timeout_s:.0f} s")
 
-    def ended(self, timeout_s: float = 120.0) -> Ended:
+    def ended(self, timeout_s: float = 240.0) -> Ended:
         out, err = self.process.communicate(timeout=timeout_s)
         return Ended(self.process.returncode, out, err)
 
-    def assert_nothing_left(self, within_s: float = 5.0) -> None:
+    def assert_nothing_left(self, within_s: float = 60.0) -> None:
         deadline_s = time.monotonic() + within_s
         while (left := still_alive(self.seen)) and time.monotonic() < deadline_s:
             time.sleep(0.1)

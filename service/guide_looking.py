@@ -1,0 +1,102 @@
+"""Looking at both fiducials of the guide: a slice of each, at one hold."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from service.estimate import FiducialEstimate
+from service.guide_geometry import GuideGeometry
+from service.plane import ImagePlane
+from service.sensing import Expectation, ProcedureFailedError, measure_again, measure_here
+from service.steps import Acquired, Measured, ProcedureSteps
+
+Expectations = tuple[Expectation | None, Expectation | None]
+_METHOD = "ml"
+
+
+@dataclass(frozen=True, eq=False)
+class BothSeen:
+    """Both fiducials at one hold, the upper one first."""
+
+    acquired: tuple[Acquired, Acquired]
+    measured: tuple[Measured, Measured]
+
+    @property
+    def frames(self) -> int:
+        """Slices of both together."""
+        return sum(one.frames for one in self.measured)
+
+    @property
+    def scan_s(self) -> float:
+        return sum(one.scan_s for one in self.measured)
+
+    @property
+    def measurement_id(self) -> int:
+        return max(one.measurement_id for one in self.measured)
+
+    @property
+    def plane(self) -> ImagePlane:
+        return ImagePlane.from_json(self.measured[0].plane)
+
+    def at(self, setpoints_um: Mapping[str, int]) -> FiducialEstimate:
+        """The state (4,) with its covariance: the two slices have nothing in common."""
+        covariance = np.zeros((4, 4))
+        covariance[:2, :2] = self.measured[0].covariance_mm2
+        covariance[2:, 2:] = self.measured[1].covariance_mm2
+        state = np.array([value for one in self.measured for value in one.plane_mm])
+        return FiducialEstimate(dict(setpoints_um), state, covariance)
+
+
+def see_both(
+    geometry: GuideGeometry, expected: Expectations, *, fresh: bool = False
+) -> ProcedureSteps[BothSeen]:
+    """One slice of each fiducial, the upper one's first."""
+    upper_mm, lower_mm = geometry.slice_positions_mm
+    first, upper = yield from measure_here(
+        _METHOD, expected[0], fresh=fresh, slice_position_mm=upper_mm
+    )
+    second, lower = yield from measure_here(_METHOD, expected[1], slice_position_mm=lower_mm)
+    seen = BothSeen((first, second), (upper, lower))
+    if not seen.plane.is_parallel_to(ImagePlane.from_json(lower.plane)):
+        raise ProcedureFailedError(
+            "plane_changed", "the slices of the two fiducials are not parallel"
+        )
+    return seen
+
+
+def see_longer(
+    geometry: GuideGeometry, seen: BothSeen, expected: Expectations, frames: int
+) -> ProcedureSteps[BothSeen]:
+    """Both again, from `frames` slices of each in all at the same hold."""
+    first, upper = yield from measure_again(
+        seen.acquired[0],
+        _METHOD,
+        expected[0],
+        frames=frames,
+        slice_position_mm=geometry.slice_positions_mm[0],
+    )
+    second, lower = yield from measure_again(
+        seen.acquired[1],
+        _METHOD,
+        expected[1],
+        frames=frames,
+        slice_position_mm=geometry.slice_positions_mm[1],
+    )
+    return BothSeen((first, second), (upper, lower))
+
+
+def gates(predicted: FiducialEstimate, least_gate_mm: float, sigmas: float) -> Expectations:
+    """Where each of the two must be, from a prediction of the state."""
+    upper, lower = (
+        FiducialEstimate(
+            predicted.setpoints_um, predicted.plane_mm[part], predicted.covariance_mm2[part, part]
+        )
+        for part in (slice(0, 2), slice(2, 4))
+    )
+    return (
+        Expectation.of(upper, least_gate_mm, sigmas),
+        Expectation.of(lower, least_gate_mm, sigmas),
+    )

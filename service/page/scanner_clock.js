@@ -1,0 +1,65 @@
+// Comparing the scanner's clock with the room's: somebody reads the scanner's clock off its console
+// and presses the button in that second.
+
+import { order } from "./api.js";
+import { byId, h, replace, setText, whenChanged } from "./dom.js";
+import { act } from "./next.js";
+import { day } from "./words.js";
+
+const DAY_S = 86400;
+// a person presses within this of the second that is shown (1 sigma of eye and hand, and its rounding)
+const UNCERTAINTY_S = 0.5;
+
+const heardS = [];
+
+// The room's clock is that of the service's computer, which need not be this browser's. Messages come
+// late by some time or other, never early: the promptest of the last ones tells.
+export function heardFromRoom(nowS) {
+  heardS.push(nowS - Date.now() / 1000);
+  if (heardS.length > 50) heardS.shift();
+}
+
+const roomMinusBrowserS = () => (heardS.length ? Math.max(...heardS) : 0);
+
+// "10:32:07" -> seconds since midnight, or NaN
+function secondsOf(text) {
+  const found = /^(\d{1,2}):(\d{2}):(\d{2})$/.exec(text.trim());
+  if (!found) return NaN;
+  const [hours, minutes, seconds] = found.slice(1).map(Number);
+  return hours < 24 && minutes < 60 && seconds < 60 ? 3600 * hours + 60 * minutes + seconds : NaN;
+}
+
+// The room's clock minus the scanner's, at this instant; within half a day.
+export function offsetS(shown, pressedMs) {
+  const room = new Date(pressedMs + 1000 * roomMinusBrowserS());
+  const ofDay = 3600 * room.getHours() + 60 * room.getMinutes() + room.getSeconds() + room.getMilliseconds() / 1000;
+  // a clock that shows whole seconds shows, on average, half a second too little
+  const difference = ofDay - (secondsOf(shown) + 0.5);
+  return difference - DAY_S * Math.round(difference / DAY_S);
+}
+
+function inWords(offset) {
+  if (Math.abs(offset) < 0.05) return "goes like the room's";
+  return `is ${Math.abs(offset).toFixed(1)} s ${offset < 0 ? "ahead of" : "behind"} the room's`;
+}
+
+export const drawScannerClock = whenChanged(({ clock, role }) => {
+  const known = clock
+    ? `The scanner's clock ${inWords(clock.offset_s)}, ± ${clock.uncertainty_s} s; ${clock.compared_s ? `compared ${day(clock.compared_s)} by ${clock.who}` : "as configured"}.`
+    : "Not compared yet: it is estimated from the slices as they arrive.";
+  const input = h("input", { id: "scanner-shows", placeholder: "hh:mm:ss", inputMode: "numeric", autocomplete: "off", size: 9, disabled: role !== "operator" });
+  const said = h("p", { class: "quiet", role: "status" });
+  let offset = NaN;
+  const use = h("button", { type: "button", hidden: true, onclick: () => act(() => order("PUT", "/api/v1/clock", { offset_s: offset, uncertainty_s: UNCERTAINTY_S })) }, "Use this");
+  const compare = h("button", {
+    type: "button", disabled: role !== "operator",
+    onclick: () => {
+      offset = offsetS(input.value, Date.now());
+      const good = Number.isFinite(offset);
+      setText(said, good ? `Then the scanner's clock ${inWords(offset)}.` : "Type what the scanner's clock shows, as 10:32:07.");
+      use.hidden = !good;
+    },
+  }, "It shows this now");
+  replace(byId("scanner-clock"), h("p", { class: "quiet" }, known),
+    h("p", {}, h("label", { htmlFor: "scanner-shows" }, "The scanner shows "), input, " ", compare), said, use);
+});
