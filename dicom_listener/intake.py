@@ -60,7 +60,6 @@ class IntakeRules:
     clock: ClockRules = field(default_factory=ClockRules)
     zone: tzinfo | None = None
     sync: Sync | None = None
-    retention_s: float = 0.0
 
 
 class Intake:
@@ -164,24 +163,6 @@ class Intake:
         self._write(rows, slices, envelope)
         self._done.add(name)
         self._metrics.intake_seconds.observe(max(0.0, time.time() - envelope.received_s))
-
-    def remove_old(self, now_s: float) -> int:
-        """Remove set-aside files past their retention; rows and events stay. Return how many."""
-        if not self._rules.retention_s > 0:
-            return 0
-        limit_s = now_s - self._rules.retention_s
-        kept = {row.path for row in self._record.slices() if row.state != "quarantined"}
-        old = {
-            row.path
-            for row in self._record.slices(state="quarantined")
-            if row.received_s < limit_s and row.path not in kept
-        }
-        removed = [name for name in sorted(old) if (self._record.case_dir / name).exists()]
-        for name in removed:
-            (self._record.case_dir / name).unlink()
-        if removed:
-            self._event("files_removed", {"count": len(removed), "paths": removed[:100]})
-        return len(removed)
 
     def alarm(self, kind: str, text: str) -> None:
         """Count, log and record something that a person should know of."""

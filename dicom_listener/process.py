@@ -19,13 +19,14 @@ from dicom_listener.clock import ClockRules, Sync
 from dicom_listener.inbox import Inbox
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.retention import remove_old
 from dicom_listener.scp import Scp, ScpRules, tls_context
 from dicom_listener.usable import SliceRules
 from room_config.listener import ListenerConfig
 from room_config.load import Config, ConfigError
 
 _POLL_S = 0.02
-_HOUSEKEEPING_S = 10.0
+_DISK_S = 10.0
 _REMOVAL_S = 600.0  # it reads every row
 _RECORD_RETRY_S = 1.0
 _MIB = 2**20
@@ -91,7 +92,6 @@ def intake_rules(config: Config, now_s: float) -> IntakeRules:
         ),
         zone=_zone(listener.scanner_time_zone),
         sync=sync,
-        retention_s=listener.retention_days * 86400,
     )
 
 
@@ -160,19 +160,19 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             received.put(path)
         log.info("serving", port=scp.port, left_over=len(left_over))
         presence = stack.enter_context(Presence(config.room.case_dir, "listener"))
-        _loop(intake, scp, inbox, received, stop, presence)
+        retention_s = config.listener.retention_days * 86400
+        tending = Tending(record, inbox, intake, retention_s)
+        _loop(intake, scp, tending, received, stop, presence)
 
 
 def _loop(
     intake: Intake,
     scp: Scp,
-    inbox: Inbox,
+    tending: "Tending",
     received: "SimpleQueue[Path]",
     stop: threading.Event,
     presence: Presence,
 ) -> None:
-    housekeeping_at_s = removal_at_s = 0.0
-    was_low = False
     while not stop.is_set():
         presence.beat()
         try:
@@ -180,12 +180,7 @@ def _loop(
             intake.look_at_record()
             while scp.alarms:
                 intake.note_alarm(*scp.alarms.popleft())
-            if time.monotonic() >= housekeeping_at_s:
-                housekeeping_at_s = time.monotonic() + _HOUSEKEEPING_S
-                was_low = _look_at_disk(intake, inbox, was_low)
-            if time.monotonic() >= removal_at_s:
-                removal_at_s = time.monotonic() + _REMOVAL_S
-                intake.remove_old(time.time())
+            tending.turn()
         except sqlite3.Error as error:
             # The slices are safe in the inbox: tried again until the record can be written.
             log.error("the case record cannot be written", error=str(error))
@@ -193,13 +188,33 @@ def _loop(
             _requeue(intake, received)
 
 
-def _look_at_disk(intake: Intake, inbox: Inbox, was_low: bool) -> bool:
-    """Alarm, once, before the disk is so full as to refuse; return whether it is low."""
-    free_bytes = inbox.free_bytes()
-    is_low = free_bytes < 2 * inbox.min_free_bytes
-    if is_low and not was_low:
-        intake.alarm("disk_low", f"{free_bytes // _MIB} MiB free")
-    return is_low
+class Tending:
+    """What is looked after now and then, in the listener's own loop: disk and retention."""
+
+    def __init__(
+        self, record: CaseRecord, inbox: Inbox, intake: Intake, retention_s: float
+    ) -> None:
+        self._record, self._inbox, self._intake = record, inbox, intake
+        self._retention_s = retention_s
+        self._disk_at_s = self._removal_at_s = 0.0
+        self._was_low = False
+
+    def turn(self) -> None:
+        now_s = time.monotonic()
+        if now_s >= self._disk_at_s:
+            self._disk_at_s = now_s + _DISK_S
+            self._look_at_disk()
+        if now_s >= self._removal_at_s:
+            self._removal_at_s = now_s + _REMOVAL_S
+            remove_old(self._record, self._retention_s, time.time())
+
+    def _look_at_disk(self) -> None:
+        """Alarm, once, before the disk is so full that slices are refused."""
+        free_bytes = self._inbox.free_bytes()
+        is_low = free_bytes < 2 * self._inbox.min_free_bytes
+        if is_low and not self._was_low:
+            self._intake.alarm("disk_low", f"{free_bytes // _MIB} MiB free")
+        self._was_low = is_low
 
 
 def _requeue(intake: Intake, received: "SimpleQueue[Path]") -> None:

@@ -18,6 +18,7 @@ from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.overrule import give_up_slices, reset_clock, sync_clock
 from dicom_listener.quirks import ENHANCED_MR_IMAGE
+from dicom_listener.retention import remove_old
 from dicom_listener.usable import SliceRules
 
 
@@ -147,13 +148,14 @@ def test_an_explicit_sync_replaces_what_was_known_of_the_clock(make_desk):
 
 
 def test_set_aside_files_are_removed_after_their_retention_and_used_ones_never(make_desk):
-    desk = make_desk(retention_s=100.0)
+    desk = make_desk()
     begin_hold(desk.record, time.time() - 5)
     (used,) = desk.receive(mr_data_set("1.2.1", began_s=time.time() - 0.6))
     (aside,) = desk.receive(mr_data_set("1.2.2", began_s=time.time() - 500))
     assert (used.state, aside.state) == ("assigned", "quarantined")
-    assert desk.intake.remove_old(time.time() + 50) == 0
-    assert desk.intake.remove_old(time.time() + 200) == 1
+    assert remove_old(desk.record, 0.0, time.time() + 1e9) == 0  # 0: keep all
+    assert remove_old(desk.record, 100.0, time.time() + 50) == 0
+    assert remove_old(desk.record, 100.0, time.time() + 200) == 1
     assert (desk.record.case_dir / used.path).exists()
     assert not (desk.record.case_dir / aside.path).exists()
     assert desk.record.events()[-1].kind == "files_removed"
