@@ -40,6 +40,7 @@ _MAX_ITERATIONS = 120  # a filtered magnitude can hold the fit at a saddle for f
 _LONGEST_STEP_PX = 0.7  # of centre and radius
 _MAX_ROUNDS = 6
 _SAME_SIGMA = 0.1  # relative change of the noise level that leaves the weights as they are
+_SAME_PRIOR = 0.5  # likewise of a prior's precision
 _SETTLED = 1e-4  # expected change of chi2, so a step of 0.01 sigma in any parameter
 _NEARLY_SETTLED = 1e-2  # good enough after all iterations: a step of 0.1 sigma
 
@@ -161,6 +162,7 @@ def fit_disc(
     signal, _ = signal_of(parameters, pixels.patch, problem.model)
     for _ in range(_MAX_ROUNDS):
         metric = _metric(problem, signal, level)
+        before = prior_precision(parameters, problem.model)
         parameters, at = _levenberg_marquardt(problem, parameters, metric)
         mask = (
             _without_outliers(problem, pixels.mask, at, metric, least_spread, outlier_sigma)
@@ -171,7 +173,8 @@ def fit_disc(
         if sigma is None:
             level = _next_sigma(problem, mask, at, level, float(abs(parameters[AMPLITUDE])))
         same = np.array_equal(mask, problem.pixels.mask) and abs(level / old - 1) < _SAME_SIGMA
-        if same:
+        after = prior_precision(parameters, problem.model)
+        if same and np.allclose(before, after, rtol=_SAME_PRIOR, atol=0):
             break
         problem, signal = replace(problem, pixels=replace(pixels, mask=mask)), at.signal
     return _summary(problem, parameters, at, level, metric.sigma / level)

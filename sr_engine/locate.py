@@ -34,7 +34,7 @@ PSFS = (
 PSF_RADII_PX = (-0.25, 0.0, 0.25)  # about the start's radius, which depends on the point spread
 PSF_OBJECTS = 3  # of a slice, that its point spread is judged by
 RADIUS_FREEDOM = (0.6, 1.6)  # of the start's radius
-GROSS_SIGMA = 8.0  # pixels are left out beyond it: a bubble is, an imperfect model is not
+GROSS_SIGMA = 20.0  # pixels are left out beyond it: a bubble is, an imperfect outline is not
 FARTHEST_PX = 2.0  # that a fit may go from its candidate, or a third of the radius if that is more
 
 

@@ -10,6 +10,9 @@ Priors, of mean zero. Unknown shading costs 10 to 25 % of precision, shading not
 costs 0.45 b R in bias; the prior is what is known of coils:
   b   a mixture: typical shading of 0.5 % a pixel, or (one frame in two) strong, of 3 % a pixel
   a   likewise 0.1 %, or 2 %, of |A| + |B| a pixel
+  B   likewise 1 % of |A| (air), or ten times |A| + |B|. A magnitude hardly tells a small B from
+      more noise, and B counts by its square alone: left free it takes 4 % off the noise level at
+      SNR 10, and with it off the covariance. The centre does not depend on it.
   w   within 40 % of what is expected (the one prior not of mean zero);  D twice |A| + |B|
 """
 
@@ -32,7 +35,7 @@ WALL, WALL_PX = 9, 10
 
 SHADING_SCALES = 0.005, 0.03  # std of the typical and of the strong, relative, per pixel
 SLOPE_SCALES = 0.001, 0.02
-_BACKGROUND_SCALE = 10.0
+BACKGROUND_SCALES = 0.01, 10.0
 _WALL_SCALE = 2.0
 _WALL_SPREAD = 0.4
 WALL_BOUNDS_PX = 0.2, 4.0
@@ -106,7 +109,9 @@ def prior_precision(parameters: Array, model: ObjectModel) -> Array:
     """
     level = float(abs(parameters[AMPLITUDE]) + abs(parameters[BACKGROUND]))
     precision = np.zeros(model.n_parameters)
-    precision[BACKGROUND] = 1 / (_BACKGROUND_SCALE * level) ** 2
+    scales = BACKGROUND_SCALES[0] * abs(float(parameters[AMPLITUDE])) / level, BACKGROUND_SCALES[1]
+    background = parameters[[BACKGROUND]] / level
+    precision[BACKGROUND] = _mixture_precision(background, scales) / level**2
     precision[SLOPES] = _mixture_precision(parameters[SLOPES] / level, SLOPE_SCALES) / level**2
     precision[SHADING] = _mixture_precision(parameters[SHADING], SHADING_SCALES)
     if model.wall_px is not None:
@@ -115,8 +120,10 @@ def prior_precision(parameters: Array, model: ObjectModel) -> Array:
     return precision
 
 
-def _mixture_precision(pair: Array, scales: tuple[float, float]) -> float:
-    narrow, wide = 1 / scales[0] ** 2, 1 / scales[1] ** 2
-    log_odds = np.log(wide / narrow) + 0.5 * float(pair @ pair) * (narrow - wide)
+def _mixture_precision(values: Array, scales: tuple[float, float]) -> float:
+    """Of values (n,) that are all from the narrow or all from the wide component."""
+    narrow, wide = 1 / max(scales[0], 1e-12) ** 2, 1 / scales[1] ** 2
+    likelihood = 0.5 * float(values @ values) * (narrow - wide)
+    log_odds = 0.5 * values.size * np.log(wide / narrow) + likelihood
     share = 1 / (1 + np.exp(min(log_odds, 700.0)))
     return float(share * narrow + (1 - share) * wide)

@@ -154,22 +154,23 @@ def reason(row: dict[str, Any], ours: float | None, better: dict[str, float], ke
     if ours is None:
         return text + "Ours failed in too many slices."
     pairs = row["slices"] - 1
-    radial = row["methods"]["radial symmetry"][key]
     if pairs == 1:
         text += "One pair only: its difference is one draw from each method's scatter, "
         text += f"uncertain by {100 / np.sqrt(4 * row['objects']):.0f} %. "
-    if radial is not None and ours > 0 and abs(radial / ours - 1) < 0.25:
-        text += (
-            f"Radial symmetry, which looks at the edges as ours does, has nearly the same "
-            f"({radial:.4f}): probably the edges moved or changed between the slices by so much."
-        )
-    elif min(better.values()) > 0.9 * ours:
-        text += "The difference is below 10 %, within what so few slices tell apart."
+    motion = row["motion_px"]
+    beside = {n: m["beside_motion_px"] for n, m in row["methods"].items()}
+    mine, others = beside[OURS], {n: beside[n] for n in better if beside[n] is not None}
+    text += f"The object's own pixels moved by {motion:.4f} (correlation, no model of the outline)"
+    if mine is None:
+        return text + "."
+    shown = ", ".join(f"{n} {v:.4f}" for n, v in sorted(others.items(), key=lambda i: i[1]))
+    text += f"; less that motion ours scatters by {mine:.4f}, {shown or 'the others not at all'}. "
+    if all(mine <= value for value in others.values()):
+        text += "Ours is the least then: it follows a motion that the others see in part."
+    elif mine < 0.5 * ours:
+        text += "Most of ours is that motion."
     else:
-        text += (
-            "Cause not established. Likely: the object is not the uniform disc of the model, and "
-            "the wall or the point spread chosen differs between the slices."
-        )
+        text += "Motion does not explain it: the fit itself is the worse here."
     return text
 
 

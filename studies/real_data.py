@@ -30,7 +30,9 @@ from studies.repeats import (
     Tracks,
     find_objects,
     load_groups,
+    registered_steps_px,
     scatter,
+    scatter_beside_motion,
     track,
 )
 
@@ -99,18 +101,21 @@ def repeat_row(group: Group, as_taken: Tracks) -> dict[str, Any]:
     moves = np.random.default_rng(1).uniform(-0.5, 0.5, (len(few.frames), 2))
     moved = track(few, list(as_taken.objects), moves)
     methods = {}
+    steps = registered_steps_px(as_taken)
     for name in METHODS:
         taken_there, at_phases = (scatter(t.centres_px[name]) for t in (as_taken, moved))
         methods[name] = {
             "as_taken_px": finite(taken_there.neighbours_px),
             "relative_px": finite(taken_there.relative_px),
             "displaced_px": finite(at_phases.neighbours_px),
+            "beside_motion_px": finite(scatter_beside_motion(as_taken, name, steps)),
             "failures": taken_there.failures,
             "attempts": taken_there.attempts,
         }
     return {
         "group": group.name, "kind": group.kind, "objects": len(as_taken.objects),
         "slices": len(group.frames), "spacing_mm": group.spacing_mm[0], "methods": methods,
+        "motion_px": float(np.median(np.sqrt(np.mean(steps**2, axis=(1, 2)) / 2))),
     }  # fmt: skip
 
 

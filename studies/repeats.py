@@ -12,12 +12,14 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import fourier_shift
+from skimage.registration import phase_cross_correlation
 
 from dicom_listener.pixels import magnitude_pixels
 from dicom_listener.reasons import UnusableError
 from sr_engine.detect import Candidate, detect
 from sr_engine.errors import EngineError
-from sr_engine.locate import likeliest_psf, refine
+from sr_engine.locate import PSF_OBJECTS, likeliest_psf, refine
+from sr_engine.psf import Psf
 from studies.peers import PEERS, PeerFailedError, run_peer
 
 Array = NDArray[np.float64]
@@ -27,6 +29,7 @@ METHODS = (OURS, *PEERS)
 KINDS = ("echo_train", "inversion_series", "repeat_acq", "dynamic_epi")
 VIAL_RADII_MM = (4.5, 12.0)
 SAME_OBJECT_PX = 3.0
+REGISTRATION_MARGIN_PX = 8.0
 MOST_LOOKED_AT = 6  # slices of a group that are searched for objects
 
 
@@ -129,6 +132,7 @@ def track(group: Group, objects: list[Candidate], displacements_px: Array | None
     pixels repeats well on slices that do not move; this shows what it is worth on those that do.
     """
     moves = np.zeros((len(group.frames), 2)) if displacements_px is None else displacements_px
+    psf = likeliest_psf(group.frames[0], objects[:PSF_OBJECTS])  # one protocol, one point spread
     shape = (len(objects), len(group.frames), 2)
     centres = {name: np.full(shape, np.nan) for name in METHODS}
     for k, (original, move) in enumerate(zip(group.frames, moves, strict=True)):
@@ -138,7 +142,7 @@ def track(group: Group, objects: list[Candidate], displacements_px: Array | None
             there = replace(seen, centre_px=(row, col))
             for name in METHODS:
                 with suppress(EngineError, PeerFailedError):
-                    centres[name][i, k] = _centre(name, frame, there) - move
+                    centres[name][i, k] = _centre(name, frame, there, psf) - move
     return Tracks(group, tuple(objects), centres)
 
 
@@ -148,10 +152,34 @@ def displaced(frame: Array, move_px: Array) -> Array:
     return np.maximum(moved, 0.0) if frame.min() >= 0 else moved
 
 
-def _centre(name: str, frame: Array, seen: Candidate) -> Array:
+def _centre(name: str, frame: Array, seen: Candidate, psf: Psf) -> Array:
     if name == OURS:
-        return refine(frame, seen, likeliest_psf(frame, [seen])).centre_px
+        return refine(frame, seen, psf).centre_px
     return run_peer(PEERS[name], frame, seen.centre_px, seen.radius_px)
+
+
+def registered_steps_px(tracks: Tracks) -> Array:
+    """(objects, slices - 1, 2): how far each object's pixels moved to the next slice.
+
+    By correlation of all pixels of the object, without any model of its outline: independent of
+    every method compared, it tells motion of the phantom from scatter of a method.
+    """
+    frames = tracks.group.frames
+    steps = np.zeros((len(tracks.objects), len(frames) - 1, 2))
+    for i, seen in enumerate(tracks.objects):
+        reach = seen.radius_px + REGISTRATION_MARGIN_PX
+        rows, cols = (slice(max(0, int(x - reach)), int(x + reach) + 2) for x in seen.centre_px)
+        for k, (one, next_one) in enumerate(zip(frames[:-1], frames[1:], strict=True)):
+            shift, _, _ = phase_cross_correlation(
+                one[rows, cols], next_one[rows, cols], upsample_factor=500, normalization=None
+            )
+            steps[i, k] = -np.asarray(shift)
+    return steps
+
+
+def scatter_beside_motion(tracks: Tracks, method: str, steps_px: Array) -> float:
+    """Std per axis as in `Scatter`, of what the method sees less what the pixels did."""
+    return _rms_per_object(np.diff(tracks.centres_px[method], axis=1) - steps_px)
 
 
 @dataclass(frozen=True)
