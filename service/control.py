@@ -206,7 +206,9 @@ class _Closing(Exception):
     """The loop is asked to end; what runs stays as it is recorded."""
 
 
-def _answer(commands: Commands, asked: _Asked, moving: bool, publish: Callable[[], None]) -> None:
+def _answer(
+    commands: Commands, asked: _Asked, moving: bool, publish: Callable[[], None]
+) -> None:
     """Carry out what was asked; the state that shows it is published before the answer is given."""
     if not asked.future.set_running_or_notify_cancel():
         return  # whoever asked has given up waiting: not carried out
