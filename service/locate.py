@@ -19,6 +19,7 @@ from dicom_listener.header import Slice
 from dicom_listener.read import Frame, read_frames
 from dicom_listener.reasons import UnusableError
 from service.files import BadFileError, files_of, geometry_of, read_shift_table
+from sr_engine.checks import refuse_non_square
 from sr_engine.detect import detect
 from sr_engine.errors import EngineError, NoRoundObjectError
 from sr_engine.localize import Localization, localize
@@ -112,6 +113,7 @@ def _round_objects(
     frame: Frame, file: Path, method: str, radii_mm: Sequence[float], roi: tuple[int, ...] | None
 ) -> Rows:
     header, pixels = frame
+    refuse_non_square(geometry_of(header, file).spacing_mm)
     spacing = float(np.mean(geometry_of(header, file).spacing_mm))
     radii_px = (radii_mm[0] / spacing, radii_mm[1] / spacing)
     bounds = None if roi is None else (roi[0], roi[1], roi[2], roi[3])
@@ -165,6 +167,7 @@ def _locate_together(
     header = frames[0][0]
     spacing = float(np.mean(geometry_of(header, files[0]).spacing_mm))
     try:
+        refuse_non_square(geometry_of(header, files[0]).spacing_mm)
         one = localize(
             np.array([frame[1] for frame in frames]),
             np.array(shifts),

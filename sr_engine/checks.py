@@ -5,6 +5,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from sr_engine.errors import (
     ConstantFrameError,
+    NonSquarePixelsError,
     NotFiniteError,
     ParameterError,
     SaturatedError,
@@ -14,6 +15,7 @@ from sr_engine.errors import (
 Array = NDArray[np.float64]
 
 _SMALLEST_FRAME = 8  # pixels along an axis; less does not hold an object and its surroundings
+_SQUARE_WITHIN = 0.01  # an ellipse of so little moves no centre and few radii
 _SATURATED_SHARE = 0.25  # of the object's area at the very same highest value
 
 
@@ -78,6 +80,16 @@ def checked_point(point_px: ArrayLike | None, name: str) -> tuple[float, float] 
     if not np.isfinite(point).all():
         raise NotFiniteError(f"{name} is not finite: {point}")
     return float(point[0]), float(point[1])
+
+
+def refuse_non_square(spacing_mm: tuple[float, float]) -> None:
+    """Raise NonSquarePixelsError where the sides of a pixel differ by more than 1 %."""
+    between_rows, between_cols = spacing_mm
+    if not abs(between_rows / between_cols - 1) <= _SQUARE_WITHIN:
+        raise NonSquarePixelsError(
+            f"pixels of {between_rows:g} x {between_cols:g} mm (between rows, between columns) are "
+            "not square: a round object is an ellipse in them"
+        )
 
 
 def refuse_saturated(values: Array, radius_px: float, level: float | None) -> None:

@@ -21,6 +21,12 @@ class ParameterError(EngineError):
     reason = "parameter"
 
 
+class NonSquarePixelsError(EngineError):
+    """Pixels of unequal sides: a round object is an ellipse in them, which is not modelled."""
+
+    reason = "non-square-pixels"
+
+
 class NotFiniteError(EngineError):
     """NaN or infinity among pixels, shifts or start values."""
 

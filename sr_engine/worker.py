@@ -23,6 +23,7 @@ from case_record.rows import Measurement, SliceRow
 from dicom_listener.pixels import magnitude_pixels
 from dicom_listener.reasons import UnusableError
 from room_config.load import Config
+from sr_engine.checks import refuse_non_square
 from sr_engine.errors import (
     EngineError,
     ObjectAtBorderError,
@@ -34,6 +35,7 @@ from sr_engine.hough import HoughSettings
 from sr_engine.localize import SEARCH_PX, Localization, localize
 from sr_engine.paper import PaperMethod, PaperSettings, localize_paper
 from sr_engine.psf import Psf
+from sr_engine.recognise import psf_of_noise
 from sr_engine.reconstruct import reconstruct
 
 IMAGES = "images"
@@ -41,6 +43,8 @@ ALIVE = "worker.alive"
 _SAME_PLACE = 1e-6
 _SAME_SLICE_MM = 0.5
 log = structlog.get_logger()
+
+PointSpreads = dict[tuple[str, tuple[int, int]], Psf]  # by series and size of its slices
 
 
 class UnusableSlicesError(Exception):
@@ -69,6 +73,7 @@ def serve(config: Config, should_stop: Callable[[], bool]) -> None:
     case_dir = config.room.case_dir
     alive = case_dir / ALIVE
     said_s = 0.0
+    psfs: PointSpreads = {}
     with CaseRecord(case_dir, create=True) as record, Presence(case_dir, "worker") as presence:
         while not should_stop():
             presence.beat()
@@ -76,16 +81,22 @@ def serve(config: Config, should_stop: Callable[[], bool]) -> None:
                 alive.touch()
                 said_s = time.monotonic()
             for request in record.requested_measurements():
-                measure(record, request, config.worker.reconstruction_factor)
+                measure(record, request, config.worker.reconstruction_factor, psfs)
             time.sleep(config.worker.poll_s)
 
 
-def measure(record: CaseRecord, request: Measurement, factor: int) -> None:
-    """Carry out one requested measurement and record its result, or why there is none."""
+def measure(
+    record: CaseRecord, request: Measurement, factor: int, psfs: PointSpreads | None = None
+) -> None:
+    """Carry out one requested measurement and record its result, or why there is none.
+
+    psfs: point spreads of the series seen so far, each recognised once; added to.
+    """
     number = request.measurement_id
     try:
         frames = gather_frames(record, request)
-        found = localize_request(frames, request.method, request.request)
+        psf = point_spread(frames, {} if psfs is None else psfs)
+        found = localize_request(frames, request.method, request.request, psf)
         result = describe_result(frames, found)
         result["reconstruction"] = _reconstruction(record.case_dir, number, frames, factor)
     except (EngineError, UnusableSlicesError, UnusableError) as error:
@@ -124,6 +135,16 @@ def gather_frames(record: CaseRecord, request: Measurement) -> Frames:
     geometry = _common_geometry(slices)
     shifts_px = np.array(shifts_mm, dtype=float) / np.array(geometry.spacing_mm)
     return Frames(np.array(pixels), shifts_px, geometry, tuple(slices))
+
+
+def point_spread(frames: Frames, psfs: PointSpreads) -> Psf:
+    """The point spread of the slices' series, recognised in the noise of the first one seen."""
+    first = frames.slices[0].header
+    key = (str(first.get("series_instance_uid", "")), frames.geometry.shape)
+    if key not in psfs:
+        psfs[key] = psf_of_noise(frames.pixels[0])
+        log.info("point spread", series=key[0], kind=psfs[key].kind, acquired=psfs[key].acquired)
+    return psfs[key]
 
 
 def is_at_position(row: SliceRow, slice_position_mm: float | None) -> bool:
@@ -202,6 +223,7 @@ def localize_request(
     region_px (r0, c0, r1, c1), where to look then (None: the whole slice); shift_sigma_mm
     (standard deviation of a commanded shift, one axis). Raises an EngineError.
     """
+    refuse_non_square(frames.geometry.spacing_mm)
     spacing = np.array(frames.geometry.spacing_mm)
     mean_mm = float(np.mean(spacing))
     low_mm, high_mm = request["radius_mm"]

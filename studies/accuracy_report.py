@@ -17,7 +17,8 @@ are public. Every figure below was measured by
 
 All methods get the same pixels, the same start and the same radius. Ours is the maximum-likelihood
 fit of `sr_engine.locate.refine`: disc with or without a wall, through the likeliest of a short list
-of point spreads. The others, at settings of our choosing, are described in `studies/peers.py`.
+of point spreads, one for each group. The others, at settings of our choosing, are described in
+`studies/peers.py`.
 
 What to hold against these figures: the short list of point spreads and the limit for outliers in
 `sr_engine.locate` were chosen among five variants by their scatter in about half of these very

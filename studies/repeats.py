@@ -7,6 +7,7 @@ frames, as in the project's collection of public MR slices.
 import csv
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -169,7 +170,7 @@ def registered_steps_px(tracks: Tracks) -> Array:
     for i, seen in enumerate(tracks.objects):
         reach = seen.radius_px + REGISTRATION_MARGIN_PX
         rows, cols = (slice(max(0, int(x - reach)), int(x + reach) + 2) for x in seen.centre_px)
-        for k, (one, next_one) in enumerate(zip(frames[:-1], frames[1:], strict=True)):
+        for k, (one, next_one) in enumerate(pairwise(frames)):
             shift, _, _ = phase_cross_correlation(
                 one[rows, cols], next_one[rows, cols], upsample_factor=500, normalization=None
             )
