@@ -54,7 +54,7 @@ def final_table(results: Sequence[PunctureResult], unintended: int | None) -> Ta
     if unintended is not None:
         caption = f"unintended motions: {unintended}; {caption}"
     table = Table(title="AutoSPINe demo", caption=caption)
-    names = ("puncture", "true error", "estimated", "σ", "iterations", "frames", "scan time")
+    names = ("puncture", "true error", "estimated", "σ", "iterations", "frames", "scan")
     for name in names:
         table.add_column(name, justify="right")
     for number, result in enumerate(results, start=1):

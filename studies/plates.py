@@ -79,12 +79,24 @@ def similarity(source: Array, target: Array, mirror: bool = True) -> Array:
     return np.asarray(scale * (source - mean_a) @ turn.T + mean_b)
 
 
+def residuals_mm(source: Array, target: Array) -> Array:
+    """What a similarity fit of source to target leaves, (n, 2), NaN where either is."""
+    return similarity(source, target) - target
+
+
 def residual_mm(source: Array, target: Array) -> float:
     """Rms distance of source from target after a similarity fit, for its 4 parameters."""
-    left = similarity(source, target) - target
+    left = residuals_mm(source, target)
     good = np.isfinite(left).all(axis=1)
     degrees = max(2 * int(good.sum()) - 4, 1)
     return float(np.sqrt(2 * np.sum(left[good] ** 2) / degrees))
+
+
+def likeness(one_mm: Array, other_mm: Array) -> float:
+    """Correlation of two sets of residuals (n, 2) in the same frame; rows with NaN left out."""
+    good = np.isfinite(one_mm).all(axis=1) & np.isfinite(other_mm).all(axis=1)
+    one, other = one_mm[good], other_mm[good]
+    return float(np.sum(one * other) / np.sqrt(np.sum(one**2) * np.sum(other**2)))
 
 
 def consensus(scans: list[Array], rounds: int = 10) -> Array:

@@ -22,7 +22,15 @@ from dicom_listener.reasons import UnusableError
 from sr_engine.detect import detect
 from sr_engine.errors import EngineError
 from studies.accuracy_report import write_report
-from studies.plates import consensus, in_one_order, match_to_design, residual_mm, taken
+from studies.plates import (
+    consensus,
+    in_one_order,
+    likeness,
+    match_to_design,
+    residual_mm,
+    residuals_mm,
+    taken,
+)
 from studies.repeats import (
     METHODS,
     VIAL_RADII_MM,
@@ -138,22 +146,47 @@ def plate_rows(plates: list[Tracks], design_mm: Array) -> list[dict[str, Any]]:
             continue
         places = [positions_mm(t, METHODS[0]) for t in scans]
         orders = in_one_order(places, [match_to_design(p, design_mm) for p in places])
-        for name in METHODS:
-            vials = [taken(positions_mm(t, name), o) for t, o in zip(scans, orders, strict=True)]
-            for scan, own in zip(scans, vials, strict=True):
-                others = [
-                    v
-                    for other, v in zip(scans, vials, strict=True)
-                    if scanner_of(other) != scanner_of(scan) and usable(v)
-                ]
-                if not usable(own) or not others:
-                    continue
-                rows.append({
-                    "plate": plate, "scan": scan.group.name, "method": name,
-                    "vials": int(np.isfinite(own[:, 0]).sum()),
-                    "consensus_mm": residual_mm(own, consensus(others)),
-                    "design_mm": residual_mm(own, design_mm),
-                })  # fmt: skip
+        vials = {
+            name: [taken(positions_mm(t, name), o) for t, o in zip(scans, orders, strict=True)]
+            for name in METHODS
+        }
+        for k, scan in enumerate(scans):
+            rows += scan_rows(scans, vials, k, design_mm, {"plate": plate, "scan": scan.group.name})
+    return rows
+
+
+def scan_rows(
+    scans: list[Tracks],
+    vials_mm: dict[str, list[Array]],
+    k: int,
+    design_mm: Array,
+    names: dict[str, str],
+) -> list[dict[str, Any]]:
+    """One scan by every method: beside the other scanners, the drawing, its own scanner again."""
+    rows, ours_mm = [], None
+    for name, places in vials_mm.items():
+        own = places[k]
+        beside = [
+            (scanner_of(scan) == scanner_of(scans[k]), place)
+            for j, (scan, place) in enumerate(zip(scans, places, strict=True))
+            if j != k and usable(place)
+        ]
+        others = [place for same, place in beside if not same]
+        again = [place for same, place in beside if same]
+        if not usable(own) or not others:
+            continue
+        agreed = consensus(others)
+        left_mm = residuals_mm(own, agreed)
+        if name == METHODS[0]:
+            ours_mm = left_mm
+        rows.append({
+            **names, "method": name,
+            "vials": int(np.isfinite(own[:, 0]).sum()),
+            "consensus_mm": residual_mm(own, agreed),
+            "design_mm": residual_mm(own, design_mm),
+            "again_mm": residual_mm(own, again[0]) if again else None,
+            "like_ours": None if ours_mm is None else likeness(left_mm, ours_mm),
+        })  # fmt: skip
     return rows
 
 
