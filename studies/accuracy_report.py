@@ -201,8 +201,8 @@ def _why(ours: dict[str, Any], better: list[dict[str, Any]]) -> str:
             )
             if ours["again_mm"] < other["again_mm"]:
                 text += (
-                    ". So the residual is for the most part the plate's and the gradients', and the "
-                    "other's larger error of its own happens to make it less here"
+                    ". So the residual is for the most part the plate's and the gradients', and "
+                    "the other's larger error of its own happens to make it less here"
                 )
         texts.append(text + ".")
     return " ".join(texts)
