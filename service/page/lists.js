@@ -41,11 +41,18 @@ export const drawAlarms = whenChanged((alarms) => {
 });
 
 // A hold that lacks slices keeps the next ones waiting until somebody says that none will come.
-function giveUp(rows, hold) {
-  const input = h("input", { id: "lacking-hold", type: "number", min: 1, step: 1, value: hold?.hold_id ?? 1 });
-  return h("p", { class: "give-up" }, h("label", { htmlFor: "lacking-hold" }, "No more slices will come of hold "), input, " ",
-    h("button", { type: "button", onclick: () => act(() => order("POST", `/api/v1/holds/${input.valueAsNumber}/give-up`, { why: "said on the page" })) }, "Give them up"));
-}
+// Made once and left alone: a list that is drawn anew must not change the number that was typed.
+const giveUp = whenChanged((offered) => {
+  const input = h("input", { id: "lacking-hold", type: "number", min: 1, step: 1, required: true });
+  const form = h("form", {
+    class: "give-up",
+    onsubmit: (event) => {
+      event.preventDefault();
+      act(() => order("POST", `/api/v1/holds/${input.valueAsNumber}/give-up`, { why: "said on the page" }));
+    },
+  }, h("label", { htmlFor: "lacking-hold" }, "No more slices will come of hold "), input, " ", h("button", {}, "Give them up"));
+  replace(byId("give-up"), offered ? form : null);
+});
 
 // Slices that were set aside, each with its reason, and the way back into a hold.
 export async function drawAside(state, role) {
@@ -61,7 +68,8 @@ export async function drawAside(state, role) {
       h("td", {}, role === "operator" && hold && row.geometry ? h("button", {
         type: "button", onclick: () => act(() => order("POST", `/api/v1/slices/${row.slice_id}/assignment`, { hold_id: hold.hold_id })),
       }, `Use at hold ${hold.hold_id}`) : null)))));
-  replace(byId("aside"), rows.length ? table : h("p", { class: "quiet" }, "None."), role === "operator" && rows.length ? giveUp(rows, hold) : null);
+  replace(byId("aside"), rows.length ? table : h("p", { class: "quiet" }, "None."));
+  giveUp(role === "operator" && rows.length > 0);
 }
 
 export const drawCase = whenChanged(({ description, case_uid, role }) => {
