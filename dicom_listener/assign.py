@@ -174,11 +174,15 @@ def _by_time(
                 f"received {after_s:.1f} s after hold {hold.hold_id} had ended",
             )
         return hold, Assigned(hold.hold_id, interval.source, earliest_s, latest_s)
-    return _outside(holds, earliest_s, latest_start_s, latest_s)
+    return _outside(holds, earliest_s, latest_start_s, latest_s, rules.guard_s)
 
 
 def _outside(
-    holds: Sequence[HoldWindow], earliest_s: float, latest_start_s: float, latest_s: float
+    holds: Sequence[HoldWindow],
+    earliest_s: float,
+    latest_start_s: float,
+    latest_s: float,
+    guard_s: float,
 ) -> Quarantined:
     before = [hold for hold in holds if hold.settled_at_s <= latest_s]
     if not before:
@@ -186,12 +190,16 @@ def _outside(
         text = f"acquired {early_s:.2f} s before the first hold had settled"
         return Quarantined(Reason.NO_HOLD, text)
     hold = before[-1]
+    after_s = earliest_s - hold.settled_at_s
+    settled = f"hold {hold.hold_id} had settled"
     if hold.ended_at_s is not None and earliest_s >= hold.ended_at_s:
         return Quarantined(Reason.NO_HOLD, f"acquired after hold {hold.hold_id} had ended")
-    if earliest_s < hold.settled_at_s:
-        early_s = hold.settled_at_s - earliest_s
+    if after_s < 0:
         sure = "began" if latest_start_s < hold.settled_at_s else "may have begun"
-        text = f"the acquisition {sure} {early_s:.2f} s before hold {hold.hold_id} had settled"
+        text = f"the acquisition {sure} {-after_s:.2f} s before {settled}"
+        return Quarantined(Reason.OUTSIDE_HOLD, text)
+    if after_s < guard_s:
+        text = f"the acquisition may have begun only {after_s:.2f} s after {settled}"
         return Quarantined(Reason.OUTSIDE_HOLD, text)
     return Quarantined(
         Reason.OUTSIDE_HOLD, f"the acquisition may have lasted beyond hold {hold.hold_id}"

@@ -186,7 +186,8 @@ class DemoRoom:
                 "port": page_port,
                 "bridge_link": str(line),
                 "confirm_moves": False,
-                "settle_s": 0.15,
+                # more than the guard and what the prompt delay leaves open of the clock
+                "settle_s": 0.25,
                 "rescan_after_s": 6.0,
             },
             "virtual": {k: v for k, v in self.virtual_table.items() if k != "scanner"},

@@ -49,6 +49,7 @@ def test_the_acquisition_must_begin_after_settling_with_the_guard_and_the_worst_
     assert isinstance(decide(holds=[hold]), Assigned)
     later = replace(hold, settled_at_s=hold.settled_at_s + 0.01)
     assert why(decide(holds=[later])) == Reason.OUTSIDE_HOLD
+    assert "begun only 0.09 s after hold 1 had settled" in decide(holds=[later]).text
 
 
 def test_an_acquisition_that_may_have_lasted_into_the_move_is_not_used():
