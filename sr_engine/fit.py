@@ -11,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
+from scipy.linalg.lapack import dposv
 
 from sr_engine.errors import NotConvergedError
 from sr_engine.model import DISC, Shape, unit_object
@@ -174,7 +175,7 @@ def fit_disc(
             level = _next_sigma(problem, mask, at, level, float(abs(parameters[AMPLITUDE])))
         same = np.array_equal(mask, problem.pixels.mask) and abs(level / old - 1) < _SAME_SIGMA
         after = prior_precision(parameters, problem.model)
-        if same and np.allclose(before, after, rtol=_SAME_PRIOR, atol=0):
+        if same and np.all(np.abs(before - after) <= _SAME_PRIOR * after):
             break
         problem, signal = replace(problem, pixels=replace(pixels, mask=mask)), at.signal
     return _summary(problem, parameters, at, level, metric.sigma / level)
@@ -307,16 +308,16 @@ def _damped_step(
     at: _Linearised, precision: Array, gradient: Array, damping: float, free: NDArray[np.bool_]
 ) -> Array:
     """Newton's step where the Hessian is positive, the Gauss-Newton step elsewhere, damped."""
-    gauss_newton = at.information + np.diag(precision)
-    damper = np.diag(damping * np.diag(gauss_newton))
-    chosen = np.ix_(free, free)
-    hessian = (gauss_newton + at.bend + damper)[chosen]
-    try:
-        np.linalg.cholesky(hessian)
-    except np.linalg.LinAlgError:
-        hessian = (gauss_newton + damper)[chosen]
+    damped = at.information.copy()
+    damped.flat[:: free.size + 1] = (1 + damping) * (damped.diagonal() + precision)
+    newton = damped + at.bend
+    if not free.all():
+        chosen = np.ix_(free, free)
+        damped, newton, gradient = damped[chosen], newton[chosen], gradient[free]
+    # LAPACK's own driver: one call that also tells whether the matrix is positive
+    _, solution, failed = dposv(newton, gradient)
     step = np.zeros(free.size)
-    step[free] = np.linalg.solve(hessian, gradient[free])
+    step[free] = np.linalg.solve(damped, gradient) if failed else solution
     # beyond a pixel the linearised edge says nothing: a long step is only its direction
     return step * min(1.0, _LONGEST_STEP_PX / max(float(np.max(np.abs(step[:AMPLITUDE]))), 1e-12))
 
