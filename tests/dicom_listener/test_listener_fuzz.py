@@ -105,13 +105,14 @@ def pdu_campaign(folder: Path, count: int) -> None:
         request = association_request()
         for seed in range(count):
             attack(listener.port, seed, request)
+        # those who fell silent hold their places until the timeouts take them away
+        wait_for(lambda: threads_of(listener.process.pid) < 12)
         ae = AE("SCANNER")
         ae.add_requested_context(MR_IMAGE)
         association = mended(ae.associate("127.0.0.1", listener.port, ae_title="AUTOSPINE"))
         assert association.is_established
         assert association.send_c_store(mr_data_set()).Status == 0
         association.release()
-        wait_for(lambda: threads_of(listener.process.pid) < 12)
         assert listener.process.poll() is None
     finally:
         listener.end()
