@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 import pytest
 from attended_room import AttendedRoom, running_room
 from browser import CHROMIUM, Complaints, running_browser
+from httpx._config import DEFAULT_TIMEOUT_CONFIG
 from offline_arguments import calibration_arguments
 from playwright.sync_api import Browser, Page, expect
 
@@ -15,6 +16,9 @@ from simulator.stage_physics import StageParameters
 from studies.offline_room import MrImaging, OfflineRoom
 
 _PATIENCE_MS = 60_000
+# httpx gives up after 5 s unless told otherwise; a busy machine is not what these tests are about
+for _part in ("connect", "read", "write", "pool"):
+    setattr(DEFAULT_TIMEOUT_CONFIG, _part, 60.0)
 
 
 @pytest.fixture
