@@ -265,13 +265,14 @@ def test_slices_that_will_not_come_are_given_up_where_slices_were_set_aside(
     slice_ = client.slices(state="assigned")[0]
     client.assign_slice(slice_.slice_id, None, why="a doubtful one")
     assert slice_.hold_id is not None
+    before = client.state().event_id
     page.locator("#lacking-hold").fill(str(slice_.hold_id))
     # the list is drawn anew under the operator's hands; what was typed stays
     client.describe_case("another list")
     expect(page.locator("#events li").first).to_contain_text("another list")
     page.get_by_role("button", name="Give them up").click()
     given_up = wait_for(
-        lambda: [e for e in client.events() if e.kind == "slices_given_up"],
+        lambda: [e for e in client.events(after=before) if e.kind == "slices_given_up"],
         lambda found: found,
     )
     assert given_up[-1].who == "operator"
