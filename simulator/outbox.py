@@ -1,6 +1,7 @@
 """The scanner's outbox: sends instances by C-STORE when they are due, and tries again.
 
-One thread of its own, so that a slow or dead receiver never keeps the scanner from scanning.
+While one is to be tried again the others wait behind it, so what could not be sent arrives in the
+order in which it was due. One thread of its own, so that a slow or dead receiver never keeps the scanner from scanning.
 """
 
 import heapq
@@ -50,6 +51,7 @@ class Outbox:
         self._settings = settings
         self._report = report
         self._waiting: list[Push] = []
+        self._resume_s = 0.0  # nothing is sent before (time.monotonic)
         self._sequence = 0
         self._changed = threading.Condition()
         self._stopped = False
@@ -79,19 +81,21 @@ class Outbox:
 
     def _run(self) -> None:
         while batch := self._next_batch():
-            for push in self._send(batch):
+            if again := self._send(batch):
                 with self._changed:
-                    heapq.heappush(self._waiting, push)
+                    self._resume_s = time.monotonic() + self._settings.retry_s
+                    for push in again:
+                        heapq.heappush(self._waiting, push)
 
     def _next_batch(self) -> list[Push]:
         """Wait until something is due; everything due, in order. Empty when stopped."""
         with self._changed:
             while not self._stopped:
                 now = time.monotonic()
-                if self._waiting and self._waiting[0].due_s <= now:
+                next_s = max(self._waiting[0].due_s, self._resume_s) if self._waiting else None
+                if next_s is not None and next_s <= now:
                     return self._take_due(now)
-                wait_s = self._waiting[0].due_s - now if self._waiting else None
-                self._changed.wait(wait_s)
+                self._changed.wait(None if next_s is None else next_s - now)
             return []
 
     def _take_due(self, now_s: float) -> list[Push]:
@@ -111,8 +115,7 @@ class Outbox:
             elif _is_final(status) or push.attempts >= self._settings.retries:
                 self._report(self._delivery(push, False, status, reason))
             else:
-                due_s = time.monotonic() + self._settings.retry_s
-                again.append(replace(push, due_s=due_s, attempts=push.attempts + 1))
+                again.append(replace(push, attempts=push.attempts + 1))
         if association.is_established:
             association.release()
         return again
