@@ -1,7 +1,8 @@
 """The scanner's outbox: sends instances by C-STORE when they are due, and tries again.
 
 While one is to be tried again the others wait behind it, so what could not be sent arrives in the
-order in which it was due. One thread of its own, so that a slow or dead receiver never keeps the scanner from scanning.
+order in which it was due. One thread of its own, so that a slow or dead receiver never keeps the
+scanner from scanning.
 """
 
 import heapq

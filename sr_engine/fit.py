@@ -7,6 +7,7 @@ takes the weights, the noise level and the mask of odd pixels from the fit befor
 """
 
 from dataclasses import dataclass, replace
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +16,7 @@ from scipy.linalg.lapack import dposv
 
 from sr_engine.errors import NotConvergedError
 from sr_engine.model import DISC, Shape, unit_object
-from sr_engine.noise import NoiseKind, colour_factor, is_white, moments, sigma_of
+from sr_engine.noise import Moments, NoiseKind, colour_factor, is_white, moments, sigma_of
 from sr_engine.psf import Psf
 from sr_engine.signal import (
     AMPLITUDE,
@@ -104,12 +105,31 @@ class _Problem:
     radius_bounds_px: tuple[float, float]
     whiten: bool
 
+    @cached_property
+    def used(self) -> NDArray[np.intp]:
+        """(n,) indices of the pixels that count, in the flattened patch."""
+        return np.flatnonzero(self.pixels.mask)
+
+    @cached_property
+    def values(self) -> Array:
+        """(n,) of these pixels."""
+        return self.pixels.values.take(self.used)
+
+
+@dataclass(frozen=True, eq=False)
+class _Image:
+    """The signal of one set of parameters, and its derivatives."""
+
+    parameters: Array
+    signal: Array  # (rows, cols)
+    derivatives: Array  # (n_parameters, rows, cols)
+
 
 @dataclass(frozen=True, eq=False)
 class _Metric:
     """How residuals are weighed during one round: fixed, so that chi2 is one function."""
 
-    sigma: float
+    expected: Moments  # (n,) of the pixels at the image that the round starts from
     weights: Array  # (n,) one over the std of each pixel
     colour: Array | None  # lower Cholesky factor of the correlation of the pixels' noise
 
@@ -118,7 +138,8 @@ class _Metric:
 class _Linearised:
     """chi2 around one set of parameters."""
 
-    signal: Array  # (rows, cols)
+    image: _Image
+    expected: Moments  # (n,)
     residual: Array  # (n,) whitened
     jacobian: Array  # (n, 9) whitened
     information: Array  # (9, 9)
@@ -160,13 +181,13 @@ def fit_disc(
         parameters, level = _linear_start(problem, start)
     level = level if sigma is None else sigma
     least_spread = 1e-12 if sigma is None else 1.0  # of standardised residuals
-    signal, _ = signal_of(parameters, pixels.patch, problem.model)
     for _ in range(_MAX_ROUNDS):
-        metric = _metric(problem, signal, level)
+        image = _image(problem, parameters)
+        metric = _metric(problem, image, level)
         before = prior_precision(parameters, problem.model)
-        parameters, at = _levenberg_marquardt(problem, parameters, metric)
+        parameters, at = _levenberg_marquardt(problem, image, metric, before)
         mask = (
-            _without_outliers(problem, pixels.mask, at, metric, least_spread, outlier_sigma)
+            _without_outliers(problem, pixels.mask, at, least_spread, outlier_sigma)
             if robust
             else pixels.mask
         )
@@ -177,8 +198,8 @@ def fit_disc(
         after = prior_precision(parameters, problem.model)
         if same and np.all(np.abs(before - after) <= _SAME_PRIOR * after):
             break
-        problem, signal = replace(problem, pixels=replace(pixels, mask=mask)), at.signal
-    return _summary(problem, parameters, at, level, metric.sigma / level)
+        problem = replace(problem, pixels=replace(pixels, mask=mask))
+    return _summary(problem, parameters, at, level, metric.expected.sigma / level)
 
 
 def _linear_start(problem: _Problem, start: tuple[float, float, float]) -> tuple[Array, float]:
@@ -210,7 +231,8 @@ def _next_sigma(
     problem: _Problem, mask: Mask, at: _Linearised, sigma: float, amplitude: float
 ) -> float:
     values = problem.pixels.values[mask]
-    new = sigma_of(values, at.signal[mask], sigma, problem.noise, problem.model.n_parameters)
+    signal = at.image.signal[mask]
+    new = sigma_of(values, signal, sigma, problem.noise, problem.model.n_parameters)
     return max(new, 1e-9 * amplitude)
 
 
@@ -218,17 +240,21 @@ def _without_outliers(
     problem: _Problem,
     mask: Mask,
     at: _Linearised,
-    metric: _Metric,
     least_spread: float,
     outlier_sigma: float,
 ) -> Mask:
     """The mask without pixels that no round object explains, and without their odd neighbours."""
-    expected = moments(at.signal, metric.sigma, problem.noise)
-    size = np.abs(problem.pixels.values - expected.mean) / np.sqrt(expected.variance)
-    limit = outlier_sigma * max(1.4826 * float(np.median(size[mask])), least_spread)
-    out = mask & (size > limit)
-    if not out.any():
+    values, expected = problem.values, at.expected
+    if mask is not problem.pixels.mask:  # those left out before may come back
+        values = problem.pixels.values[mask]
+        expected = moments(at.image.signal[mask], at.expected.sigma, problem.noise)
+    within = np.abs(values - expected.mean) / np.sqrt(expected.variance)
+    limit = outlier_sigma * max(1.4826 * float(np.median(within)), least_spread)
+    if not within.max() > limit:
         return mask
+    size = np.zeros(mask.shape)
+    size[mask] = within
+    out = size > limit
     padded = np.pad(out, 1)
     rows, cols = out.shape
     near = np.zeros_like(out)
@@ -239,21 +265,29 @@ def _without_outliers(
     return keep if keep.sum() > 0.5 * mask.sum() else mask
 
 
-def _metric(problem: _Problem, signal: Array, sigma: float) -> _Metric:
+def _image(problem: _Problem, parameters: Array) -> _Image:
+    return _Image(parameters, *signal_of(parameters, problem.pixels.patch, problem.model))
+
+
+def _metric(problem: _Problem, image: _Image, sigma: float) -> _Metric:
     mask, psf = problem.pixels.mask, problem.model.psf
-    expected = moments(signal[mask], sigma, problem.noise)
+    expected = moments(image.signal.take(problem.used), sigma, problem.noise)
     colour = None
     if problem.whiten and not is_white(psf):
         colour = colour_factor(problem.pixels.patch.period, psf, mask, expected, sigma)
-    return _Metric(sigma, 1 / np.sqrt(expected.variance), colour)
+    return _Metric(expected, 1 / np.sqrt(expected.variance), colour)
 
 
-def _linearise(problem: _Problem, parameters: Array, metric: _Metric) -> _Linearised:
-    signal, derivatives = signal_of(parameters, problem.pixels.patch, problem.model)
-    mask = problem.pixels.mask
-    by_parameter = derivatives[:, mask]
-    expected = moments(signal[mask], metric.sigma, problem.noise)
-    residual = (problem.pixels.values[mask] - expected.mean) * metric.weights
+def _evaluate(problem: _Problem, parameters: Array, metric: _Metric) -> _Linearised:
+    image = _image(problem, parameters)
+    expected = moments(image.signal.take(problem.used), metric.expected.sigma, problem.noise)
+    return _linearise(problem, image, expected, metric)
+
+
+def _linearise(problem: _Problem, image: _Image, expected: Moments, metric: _Metric) -> _Linearised:
+    flat = image.derivatives.reshape(len(image.derivatives), -1)
+    by_parameter = flat.take(problem.used, axis=1)
+    residual = (problem.values - expected.mean) * metric.weights
     jacobian = (by_parameter * (expected.slope * metric.weights)).T
     force = residual
     if metric.colour is not None:
@@ -262,7 +296,7 @@ def _linearise(problem: _Problem, parameters: Array, metric: _Metric) -> _Linear
         residual, jacobian = both[:, 0], both[:, 1:]
         force = solve_triangular(metric.colour, residual, lower=True, trans="T", check_finite=False)
     bend = -(by_parameter * (force * metric.weights * expected.curvature)) @ by_parameter.T
-    return _Linearised(signal, residual, jacobian, jacobian.T @ jacobian, bend)
+    return _Linearised(image, expected, residual, jacobian, jacobian.T @ jacobian, bend)
 
 
 def _bounds(problem: _Problem) -> tuple[Array, Array]:
@@ -274,12 +308,12 @@ def _bounds(problem: _Problem) -> tuple[Array, Array]:
 
 
 def _levenberg_marquardt(
-    problem: _Problem, parameters: Array, metric: _Metric
+    problem: _Problem, start: _Image, metric: _Metric, precision: Array
 ) -> tuple[Array, _Linearised]:
     """Minimise chi2 + prior in one metric, within the bounds of radius and wall."""
     damping: float = 1e-3
-    at = _linearise(problem, parameters, metric)
-    mean, precision = prior_mean(problem.model), prior_precision(parameters, problem.model)
+    parameters, at = start.parameters, _linearise(problem, start, metric.expected, metric)
+    mean = prior_mean(problem.model)
     low, high = _bounds(problem)
     for _ in range(_MAX_ITERATIONS):
         gradient = at.jacobian.T @ at.residual - precision * (parameters - mean)
@@ -290,7 +324,7 @@ def _levenberg_marquardt(
         gain = float(gradient @ (moved - parameters))
         if gain < _SETTLED * max(1.0, cost / at.residual.size):
             return moved, at
-        there = _linearise(problem, moved, metric)
+        there = _evaluate(problem, moved, metric)
         trial = there.residual @ there.residual + precision @ (moved - mean) ** 2
         if trial <= cost * (1 + 1e-12):
             parameters, at = moved, there
@@ -367,6 +401,8 @@ def _explained(at: _Linearised, parameters: Array) -> float:
     target = at.residual + at.jacobian[:, AMPLITUDE] * parameters[AMPLITUDE]
     if parameters.size > WALL:
         target = target + at.jacobian[:, WALL] * parameters[WALL]
-    basis, _ = np.linalg.qr(at.jacobian[:, SURROUNDINGS])
-    left = target - basis @ (basis.T @ target)
-    return float(left @ left - at.residual @ at.residual)
+    surroundings = at.jacobian[:, SURROUNDINGS]
+    projection = surroundings.T @ target
+    within = at.information[np.ix_(SURROUNDINGS, SURROUNDINGS)]
+    taken = float(projection @ np.linalg.lstsq(within, projection, rcond=None)[0])
+    return float(target @ target - at.residual @ at.residual) - taken

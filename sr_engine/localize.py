@@ -11,7 +11,7 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.stats import chi2 as chi2_distribution
+from scipy.special import chdtri
 
 from sr_engine.checks import (
     checked_frames,
@@ -333,7 +333,7 @@ def _checked_consistency(residuals: Array, covariances: Array) -> float:
     exact = np.einsum("ki,kij,kj->k", residuals, np.linalg.inv(covariances), residuals)
     widened = np.linalg.inv(covariances + np.eye(2) * MODEL_FLOOR_PX**2)
     guarded = np.einsum("ki,kij,kj->k", residuals, widened, residuals)
-    if not guarded.sum() < chi2_distribution.isf(CONSISTENCY_P, dof):
+    if not guarded.sum() < chdtri(dof, CONSISTENCY_P):
         worst = int(np.argmax(guarded))
         row, col = residuals[worst]
         raise InconsistentFramesError(

@@ -20,6 +20,7 @@ from scipy.special import j0, j1
 from sr_engine.psf import Psf
 
 Array = NDArray[np.float64]
+Complex = NDArray[np.complex128]
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,33 +119,33 @@ _RADIUS_STEP = 0.125  # between expansion points; third order then errs by 1e-6 
 
 
 @lru_cache(maxsize=192)
-def _expansion(
-    period: tuple[int, int], psf: Psf, shape: Shape, radius_px: float
-) -> tuple[Array, Array, Array, Array]:
-    """Weighted spectrum at radius_px and its Taylor coefficients in the radius."""
+def _expansion(period: tuple[int, int], psf: Psf, shape: Shape, radius_px: float) -> Array:
+    """(4, P, Q): weighted spectrum at radius_px and its Taylor coefficients in the radius."""
     space = k_space(period, psf)
     k, w = space.k_abs, space.weight
     if shape.slab_px is not None:
         h = _RADIUS_STEP / 2
         low, mid, high = (shape.spectrum(k, radius_px + d) * w for d in (-h, 0.0, h))
-        return mid, (high - low) / (2 * h), (high - 2 * mid + low) / (2 * h * h), np.zeros_like(w)
+        second = (high - 2 * mid + low) / (2 * h * h)
+        return np.stack([mid, (high - low) / (2 * h), second, np.zeros_like(w)])
     q = 2 * np.pi * k
     b0, b1 = j0(q * radius_px), j1(q * radius_px)
     first = 2 * np.pi * radius_px * b0
     second = 2 * np.pi * (b0 - q * radius_px * b1)
     third = -2 * np.pi * q * (b1 + q * radius_px * b0)
     zeroth = disc_spectrum(k, radius_px)
-    return zeroth * w, first * w, second * w / 2, third * w / 6
+    return np.stack([zeroth * w, first * w, second * w / 2, third * w / 6])
 
 
-def spectrum_near(
-    period: tuple[int, int], psf: Psf, shape: Shape, radius_px: float
-) -> tuple[Array, Array]:
-    """Weighted spectrum and its derivative in the radius, from the nearest cached expansion."""
+def spectrum_near(period: tuple[int, int], psf: Psf, shape: Shape, radius_px: float) -> Array:
+    """(2, P, Q): weighted spectrum, and its derivative in the radius, by the nearest expansion."""
     base = max(round(radius_px / _RADIUS_STEP), 1) * _RADIUS_STEP
     d = radius_px - base
-    c0, c1, c2, c3 = _expansion(period, psf, shape, base)
-    return c0 + d * (c1 + d * (c2 + d * c3)), c1 + d * (2 * c2 + 3 * d * c3)
+    powers = np.array([[1.0, d, d**2, d**3], [0.0, 1.0, 2 * d, 3 * d**2]])
+    coefficients = _expansion(period, psf, shape, base)
+    # one matrix product is several times faster than the sums it stands for
+    both = powers @ coefficients.reshape(4, -1)
+    return both.reshape(2, *coefficients.shape[1:])
 
 
 @dataclass(frozen=True, eq=False)
@@ -157,12 +158,11 @@ class Patch:
 
 
 @lru_cache(maxsize=32)
-def _waves(n: int, period: tuple[int, int], psf: Psf, axis: int) -> tuple[Array, Array, Array]:
-    """cos and sin of 2 pi k x at x = 0..n-1 (n, K), and 2 pi k (K,), along one axis."""
+def _waves(n: int, period: tuple[int, int], psf: Psf, axis: int) -> tuple[Complex, Array]:
+    """exp(i q x) at x = 0..n-1 (n, K), and q = 2 pi k (K,), along one axis."""
     space = k_space(period, psf)
     q = 2 * np.pi * (space.k_row if axis == 0 else space.k_col)
-    angle = np.outer(np.arange(n), q)
-    return np.cos(angle), np.sin(angle), q
+    return np.exp(1j * np.outer(np.arange(n), q)), q
 
 
 def _displaced_waves(
@@ -170,10 +170,9 @@ def _displaced_waves(
 ) -> tuple[Array, Array]:
     """cos of q (x - centre) at consecutive pixels, and its derivative in the centre: (n, K)."""
     first = int(pixels[0])
-    cos, sin, q = _waves(len(pixels), period, psf, axis)
-    away = q * (centre_px - first)
-    cos_away, sin_away = np.cos(away), np.sin(away)
-    return cos * cos_away + sin * sin_away, sin * (q * cos_away) - cos * (q * sin_away)
+    waves, q = _waves(len(pixels), period, psf, axis)
+    displaced = waves * np.exp(-1j * (centre_px - first) * q)
+    return displaced.real, displaced.imag * q
 
 
 def unit_object(

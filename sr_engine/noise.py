@@ -4,7 +4,7 @@ Gudbjartsson & Patz, MRM 34:910 (1995).
 """
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from typing import Literal
 
 import numpy as np
@@ -24,29 +24,40 @@ _FAR_FROM_ZERO = 30.0  # in sigma: beyond it the exact variance cancels and the 
 class Moments:
     """Of pixels with a known noise-free signal: mean, its two derivatives in it, and variance."""
 
+    signal: Array
+    sigma: float
+    kind: NoiseKind
     mean: Array
     slope: Array
     curvature: Array
-    variance: Array
+
+    @cached_property
+    def variance(self) -> Array:
+        if self.kind == "gaussian":
+            return np.full_like(self.signal, self.sigma**2)
+        ratio, mean = self.signal / self.sigma, self.mean / self.sigma
+        far = np.abs(ratio) > _FAR_FROM_ZERO
+        exact = ratio**2 + 2 - mean**2
+        return self.sigma**2 * np.where(far, 1 - 0.5 / np.where(far, ratio, 1.0) ** 2, exact)
 
 
 def moments(signal: Array, sigma: float, kind: NoiseKind) -> Moments:
     """Moments of pixels with noise of std `sigma` per channel."""
     if kind == "gaussian":
-        one = np.ones_like(signal)
-        return Moments(signal, one, np.zeros_like(signal), sigma**2 * one)
+        flat, straight = np.ones_like(signal), np.zeros_like(signal)
+        return Moments(signal, sigma, kind, mean=signal, slope=flat, curvature=straight)
     ratio = signal / sigma
     x = ratio**2 / 4
     b0, b1 = i0e(x), i1e(x)
     root = np.sqrt(np.pi / 2)
-    mean = root * ((1 + 2 * x) * b0 + 2 * x * b1)
-    far = np.abs(ratio) > _FAR_FROM_ZERO
-    variance = np.where(far, 1 - 0.5 / np.where(far, ratio, 1.0) ** 2, ratio**2 + 2 - mean**2)
+    both = b0 + b1
     return Moments(
-        mean=sigma * mean,
-        slope=root * ratio / 2 * (b0 + b1),
-        curvature=root / (2 * sigma) * (b0 - b1),
-        variance=sigma**2 * variance,
+        signal,
+        sigma,
+        kind,
+        mean=(sigma * root) * (b0 + 2 * x * both),
+        slope=(root / 2) * ratio * both,
+        curvature=(root / (2 * sigma)) * (b0 - b1),
     )
 
 

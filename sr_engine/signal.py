@@ -16,6 +16,7 @@ costs 0.45 b R in bias; the prior is what is known of coils:
   w   within 40 % of what is expected (the one prior not of mean zero);  D twice |A| + |B|
 """
 
+import math
 from dataclasses import dataclass
 
 import numpy as np
@@ -124,6 +125,6 @@ def _mixture_precision(values: Array, scales: tuple[float, float]) -> float:
     """Of values (n,) that are all from the narrow or all from the wide component."""
     narrow, wide = 1 / max(scales[0], 1e-12) ** 2, 1 / scales[1] ** 2
     likelihood = 0.5 * float(values @ values) * (narrow - wide)
-    log_odds = 0.5 * values.size * np.log(wide / narrow) + likelihood
-    share = 1 / (1 + np.exp(min(log_odds, 700.0)))
-    return float(share * narrow + (1 - share) * wide)
+    log_odds = 0.5 * values.size * math.log(wide / narrow) + likelihood
+    share = 1 / (1 + math.exp(min(log_odds, 700.0)))
+    return share * narrow + (1 - share) * wide
