@@ -3,10 +3,12 @@
 import time
 
 import pytest
-from pmd_rig import axis_config, finish, opened, rig, wait_until
+from bridge_room import wait_for
+from pmd_rig import Rig, axis_config, finish, opened, rig, wait_until
 from virtual_line import VirtualLine
 
 from robot_bridge.emulator_axis import Motor
+from robot_bridge.emulator_runs import OpenRun
 from robot_bridge.motors import POLL_BOUND_S, STOP_BOUND_S, MotorError
 from robot_bridge.pmd401 import UNTRIED, PmdMotors
 
@@ -134,9 +136,25 @@ def test_stop_ends_the_motion_of_all_axes_at_once():
 def test_stop_works_before_open_and_again_and_again():
     with rig() as made:
         motors = PmdMotors([axis_config("xt", made.url, 1), axis_config("yt", made.url, 2)])
+        for _ in range(2):
+            let_run(made, 1)
+            motors.stop()
+            with made.lock:
+                assert not made.controller(1).moving
         motors.stop()
-        motors.stop()
+        assert not motors.poll().moving
         motors.close()
+
+
+def let_run(made: Rig, address: int) -> None:
+    """Somebody else's open-loop run, far longer than any test."""
+    controller = made.controller(address)
+    with made.lock:
+        controller.unpark()
+    wait_for(lambda: controller.can_run, 60, "power")
+    with made.lock:
+        controller.begin_open_run(OpenRun(10**9, 1, 100.0), "run")
+        assert controller.moving
 
 
 def test_stop_says_which_axis_did_not_confirm():
