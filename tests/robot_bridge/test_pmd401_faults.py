@@ -239,7 +239,7 @@ def test_a_lost_answer_to_a_run_that_did_start_is_found_out():
 
 
 def test_a_dead_controller_is_named_and_the_other_stops():
-    with rig(speed_factor=2.0) as made, opened(made) as motors:
+    with rig(speed_factor=0.5) as made, opened(made) as motors:
         in_motion(motors, made)
         with made.lock:
             made.controller(1).faults.dead = True
