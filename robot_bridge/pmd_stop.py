@@ -1,6 +1,6 @@
 """After the bytes that stop everything: each axis has to confirm that it stands."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 
 from robot_bridge.pmd_axis import PmdAxis
 from robot_bridge.pmd_line import PmdLine, Procedure
@@ -32,18 +32,25 @@ def confirm_stops(
         if axis.config.controller in lines
     }
     failures: set[str] = set()
-    while not all(t.done for t in tasks.values()) and clock() < deadline_s:
-        for line in lines.values():
-            try:
-                line.step(0.01)
-            except OSError as error:
-                line.cancel_all()
-                failures.add(f"controller port: {error}")
+    while not all(task.done for task in tasks.values()) and clock() < deadline_s:
+        failures |= _step(lines.values())
     unconfirmed = [name for name, task in tasks.items() if not task.done or task.error]
     for line in lines.values():
         line.cancel_all()
         line.timeout_s = timeout_s
     return [*failures, *(f"axis {name} did not confirm the stop" for name in unconfirmed)]
+
+
+def _step(lines: Iterable[PmdLine]) -> set[str]:
+    """Returns what failed; the axes on a line whose port fails confirm nothing."""
+    failures = set()
+    for line in lines:
+        try:
+            line.step(0.01)
+        except OSError as error:
+            line.cancel_all()
+            failures.add(f"controller port: {error}")
+    return failures
 
 
 def _stop_stubbornly(axis: PmdAxis) -> Procedure:
