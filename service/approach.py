@@ -15,10 +15,10 @@ from typing import Any
 import numpy as np
 
 from service.calibration import Calibration, learn_from_move
-from service.estimate import FiducialEstimate, MotionNoise, probability_within
-from service.looking import STRATEGIES, Look, LookArguments, Way, look_at_fiducial, look_longer
+from service.estimate import FiducialEstimate, probability_within
+from service.looking import STRATEGIES, Look, Way, look_at_fiducial, look_longer
 from service.plan import Plan, PlanRefusedError, Travel, plan_move
-from service.sensing import ProcedureFailedError, check_prediction, move
+from service.sensing import ProcedureFailedError, ValidationGate, check_prediction, move
 from service.steps import Answered, AskOperator, Measured, MoveTo, ProcedureSteps, ask
 
 CONFIRM = "confirm"
@@ -44,21 +44,10 @@ class ApproachArguments:
     confidence: float
     max_iterations: int
     confirm_moves: bool
-    position_gate_mm: float
-    gate_sigma: float
-    repeatability_mm: float
-    scale_error: float
+    gate: ValidationGate
     strategy: str = "adaptive"
     stop_rule: str = PROBABILITY
     seed: int = 0
-
-    @property
-    def noise(self) -> MotionNoise:
-        return MotionNoise(self.repeatability_mm, self.scale_error)
-
-    @property
-    def looking(self) -> LookArguments:
-        return LookArguments(self.position_gate_mm, self.gate_sigma, self.noise, self.seed)
 
     @property
     def travel(self) -> dict[str, Travel]:
@@ -132,11 +121,11 @@ def _look(arguments: ApproachArguments, standing: _Standing, way: Way) -> Proced
     look = yield from look_at_fiducial(
         way,
         calibration,
-        arguments.looking,
-        number=standing.looks,
+        arguments.gate,
+        seed=(arguments.seed, standing.looks),
         fresh=standing.seen is not None or standing.iterations == 0,
     )
-    check_prediction(calibration.estimate, look.found, arguments.gate_sigma, arguments.noise)
+    check_prediction(calibration.estimate, look.found, arguments.gate)
     estimate = look.found
     if STRATEGIES[arguments.strategy].fuses:
         estimate = calibration.estimate.fused_with(estimate.plane_mm, estimate.covariance_mm2)
@@ -160,7 +149,7 @@ def _more_frames(arguments: ApproachArguments, standing: _Standing) -> Procedure
     wanted = frames_that_decide(arguments, standing.calibration.estimate, seen.measured)
     if wanted <= seen.measured.frames:
         return standing
-    more = yield from look_longer(seen, seen.acquired, arguments.looking, frames=wanted)
+    more = yield from look_longer(seen, seen.acquired, arguments.gate, frames=wanted)
     # from the prior again: the slices that are in both measurements count once
     fused = seen.prior.fused_with(more.found.plane_mm, more.found.covariance_mm2)
     return replace(
@@ -207,7 +196,7 @@ def _go(
         )
     )
     predicted = calibration.estimate.moved_to(
-        moved.readback_um, calibration.jacobian, arguments.noise
+        moved.readback_um, calibration.jacobian, arguments.gate.noise
     )
     there = replace(
         standing,
@@ -218,7 +207,7 @@ def _go(
     after = yield from _look(arguments, there, way)
     if not STRATEGIES[arguments.strategy].fuses or after.seen is None:
         return after
-    jacobian = learn_from_move(calibration.jacobian, before, after.seen.found, arguments.noise)
+    jacobian = learn_from_move(calibration.jacobian, before, after.seen.found, arguments.gate.noise)
     return replace(after, calibration=replace(after.calibration, jacobian=jacobian))
 
 

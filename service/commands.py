@@ -20,9 +20,8 @@ from room_config.load import Config
 from room_config.service import GuideConfig
 from service.approach import CONFIRM
 from service.calibration import Calibration
-from service.estimate import MotionNoise
 from service.execution import Execution
-from service.fiducial_plan import approach_of, calibration_of, recording_of
+from service.fiducial_plan import approach_of, calibration_of, gate_of, recording_of
 from service.guide_plan import guide_approach_of, guide_calibration_of, guide_recording_of
 from service.plan import PLAN_VOID, PlanRefusedError, Travel, check_travel
 from service.procedures import (
@@ -434,8 +433,7 @@ class Commands:
         if calibration is None:
             raise ConflictError("not_calibrated", "Calibrate first.")
         status = self._linked()
-        service = self._config.service
-        noise = MotionNoise(service.repeatability_um / 1000, service.step_scale_error)
+        noise = gate_of(self._config).noise
         return start_point(self._record, calibration, status.positions_um, noise)
 
 

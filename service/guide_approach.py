@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from service.approach import LOOSE_MM, ask_to_confirm
 from service.calibration import Calibration, learn_from_move
-from service.estimate import FiducialEstimate, MotionNoise, probability_within
+from service.estimate import FiducialEstimate, probability_within
 from service.guide_geometry import GuideGeometry, GuideSeenWrongError, line_of_state, tip_of
 from service.guide_looking import BothSeen, gates, see_both, see_longer
 from service.plan import Plan, PlanRefusedError, Travel, plan_move
-from service.sensing import ProcedureFailedError, check_prediction, move
+from service.sensing import ProcedureFailedError, ValidationGate, check_prediction, move
 from service.steps import MoveTo, ProcedureSteps
 
 Array = NDArray[np.float64]
@@ -37,14 +37,7 @@ class GuideApproachArguments:
     confidence: float
     max_iterations: int
     confirm_moves: bool
-    position_gate_mm: float
-    gate_sigma: float
-    repeatability_mm: float
-    scale_error: float
-
-    @property
-    def noise(self) -> MotionNoise:
-        return MotionNoise(self.repeatability_mm, self.scale_error)
+    gate: ValidationGate
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,10 +120,10 @@ def _look(
 ) -> ProcedureSteps[_Standing]:
     """Look from where the robot stands; what was predicted must be what is seen."""
     prior = standing.calibration.estimate
-    expected = gates(prior, arguments.position_gate_mm, arguments.gate_sigma)
+    expected = gates(prior, arguments.gate)
     seen = yield from see_both(arguments.geometry, expected, fresh=fresh)
     here = seen.at(prior.setpoints_um)
-    check_prediction(prior, here, arguments.gate_sigma, arguments.noise)
+    check_prediction(prior, here, arguments.gate)
     return _with_look(standing, prior, seen, seen.frames, seen.scan_s)
 
 
@@ -164,7 +157,7 @@ def _more_frames(
     wanted = _frames_that_decide(arguments, standing.calibration.estimate, seen)
     if wanted <= seen.measured[0].frames:
         return standing
-    expected = gates(prior, arguments.position_gate_mm, arguments.gate_sigma)
+    expected = gates(prior, arguments.gate)
     more = yield from see_longer(arguments.geometry, seen, expected, wanted)
     # from the prior again: the slices that are in both measurements count once
     return _with_look(standing, prior, more, more.frames - seen.frames, more.scan_s - seen.scan_s)
@@ -199,7 +192,7 @@ def _go(
         )
     )
     predicted = calibration.estimate.moved_to(
-        moved.readback_um, calibration.jacobian, arguments.noise
+        moved.readback_um, calibration.jacobian, arguments.gate.noise
     )
     there = replace(
         standing,
@@ -210,7 +203,7 @@ def _go(
     after = yield from _look(arguments, there, fresh=False)
     assert after.seen is not None
     here = after.seen.at(moved.readback_um)
-    jacobian = learn_from_move(calibration.jacobian, before, here, arguments.noise)
+    jacobian = learn_from_move(calibration.jacobian, before, here, arguments.gate.noise)
     return replace(after, calibration=replace(after.calibration, jacobian=jacobian))
 
 

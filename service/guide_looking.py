@@ -10,7 +10,13 @@ import numpy as np
 from service.estimate import FiducialEstimate
 from service.guide_geometry import GuideGeometry
 from service.plane import ImagePlane
-from service.sensing import Expectation, ProcedureFailedError, measure_again, measure_here
+from service.sensing import (
+    Expectation,
+    ProcedureFailedError,
+    ValidationGate,
+    measure_again,
+    measure_here,
+)
 from service.steps import Acquired, Measured, ProcedureSteps
 
 Expectations = tuple[Expectation | None, Expectation | None]
@@ -88,7 +94,7 @@ def see_longer(
     return BothSeen((first, second), (upper, lower))
 
 
-def gates(predicted: FiducialEstimate, least_gate_mm: float, sigmas: float) -> Expectations:
+def gates(predicted: FiducialEstimate, gate: ValidationGate) -> Expectations:
     """Where each of the two must be, from a prediction of the state."""
     upper, lower = (
         FiducialEstimate(
@@ -96,7 +102,4 @@ def gates(predicted: FiducialEstimate, least_gate_mm: float, sigmas: float) -> E
         )
         for part in (slice(0, 2), slice(2, 4))
     )
-    return (
-        Expectation.of(upper, least_gate_mm, sigmas),
-        Expectation.of(lower, least_gate_mm, sigmas),
-    )
+    return gate.around(upper), gate.around(lower)

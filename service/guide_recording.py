@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 
 from service.calibration import Calibration
-from service.estimate import FiducialEstimate, MotionNoise
+from service.estimate import FiducialEstimate
 from service.guide_geometry import GuideGeometry, GuideSeenWrongError, line_of_state, tip_of
 from service.guide_looking import BothSeen, gates, see_both, see_longer
 from service.kinematics import Line
-from service.sensing import ProcedureFailedError, check_prediction
+from service.sensing import ProcedureFailedError, ValidationGate, check_prediction
 from service.steps import ProcedureSteps
 
 _MOST_FRAMES = 8
@@ -28,10 +28,7 @@ class GuideRecordingArguments:
     geometry: GuideGeometry
     lower_plane_mm: float
     sigma_mm: float
-    position_gate_mm: float
-    gate_sigma: float
-    repeatability_mm: float
-    scale_error: float
+    gate: ValidationGate
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,11 +68,10 @@ def record_guide(
 ) -> ProcedureSteps[GuidePlace]:
     """Look at both fiducials where the robot stands, with as many slices as the bound asks for."""
     prior, geometry = start.estimate, arguments.geometry
-    expected = gates(prior, arguments.position_gate_mm, arguments.gate_sigma)
+    expected = gates(prior, arguments.gate)
     seen = yield from see_both(geometry, expected, fresh=True)
     here = seen.at(prior.setpoints_um)
-    noise = MotionNoise(arguments.repeatability_mm, arguments.scale_error)
-    check_prediction(prior, here, arguments.gate_sigma, noise)
+    check_prediction(prior, here, arguments.gate)
     wanted = _slices_for(geometry, here, seen, arguments.sigma_mm)
     if wanted > seen.measured[0].frames:
         seen = yield from see_longer(geometry, seen, expected, wanted)
