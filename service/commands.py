@@ -18,7 +18,6 @@ from dicom_listener.overrule import give_up_slices, reassign, reset_clock
 from robot_bridge.client import BridgeError, BridgeStatus
 from room_config.load import Config
 from room_config.service import GuideConfig
-from service.approach import CONFIRM
 from service.calibration import Calibration
 from service.execution import Execution
 from service.fiducial_plan import approach_of, calibration_of, gate_of, recording_of
@@ -43,6 +42,7 @@ from service.procedures import (
 from service.readiness import ConflictError, may_start, ready_arrival
 from service.room_link import RoomLink
 from service.start_point import POSITION_DECLARED, positions_to_declare, start_point
+from service.steering import CONFIRM
 from service.targets import (
     ENTRY_SET,
     TARGET_SET,

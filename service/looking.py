@@ -69,6 +69,18 @@ class Look:
     method: str
     acquired: Acquired | None
 
+    @property
+    def measurement_id(self) -> int:
+        return self.measured.measurement_id
+
+    @property
+    def frames(self) -> int:
+        return self.measured.frames
+
+    @property
+    def scan_s(self) -> float:
+        return self.measured.scan_s
+
 
 def look_at_fiducial(
     way: Way,

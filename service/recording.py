@@ -66,17 +66,16 @@ def record_place(arguments: RecordingArguments, start: Calibration) -> Procedure
     check_prediction(start.estimate, look.found, gate)
     if not strategy.fuses or look.acquired is None:
         return _place(start, look.found, look)
-    wanted = slices_for(look.found, look.measured.frames, arguments.sigma_mm)
-    if wanted > look.measured.frames:
+    wanted = slices_for(look.found, look.frames, arguments.sigma_mm)
+    if wanted > look.frames:
         look = yield from look_longer(look, look.acquired, gate, frames=wanted)
     estimate = look.prior.fused_with(look.found.plane_mm, look.found.covariance_mm2)
     return _place(start, estimate, look)
 
 
 def _place(start: Calibration, estimate: FiducialEstimate, look: Look) -> Place:
-    measured = look.measured
-    calibration = replace(start, estimate=estimate, measurement_id=measured.measurement_id)
-    return Place(calibration, measured.frames, measured.scan_s)
+    calibration = replace(start, estimate=estimate, measurement_id=look.measurement_id)
+    return Place(calibration, look.frames, look.scan_s)
 
 
 def slices_for(found: FiducialEstimate, frames: int, sigma_mm: float) -> int:

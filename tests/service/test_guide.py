@@ -8,7 +8,6 @@ import pytest
 from offline_arguments import GATE
 
 from case_record.record import CaseRecord
-from service.approach import REJECT
 from service.calibration import Calibration
 from service.guide_approach import GuideApproachArguments, approach_guide
 from service.guide_calibration import GuideCalibrationArguments, calibrate_guide
@@ -28,6 +27,7 @@ from service.procedures import (
 )
 from service.replay import replay_measurements, replay_procedure
 from service.sensing import ProcedureFailedError
+from service.steering import REJECT
 from service.targets import needle_line
 from simulator.config import Fiducial, VirtualRoom
 from simulator.mr_slice import slice_geometry
