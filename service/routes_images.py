@@ -19,8 +19,8 @@ from service.images import (
     slice_file,
     slice_pixels,
 )
+from service.parameters import Id
 from service.problems import responses
-from service.routes_record import Id
 
 Window = Annotated[float | None, Query(gt=0, le=1e9, allow_inf_nan=False)]
 Level = Annotated[float | None, Query(ge=-1e9, le=1e9, allow_inf_nan=False)]
