@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from room_config.imaging import ImagingConfig
 from room_config.listener import ListenerConfig
+from room_config.openigtlink import OpenIgtLinkConfig
 from room_config.room import RoomConfig
 from room_config.service import ServiceConfig
 from room_config.worker import WorkerConfig
@@ -41,6 +42,7 @@ class Config(BaseModel):
     listener: ListenerConfig = Field(default_factory=ListenerConfig)
     worker: WorkerConfig = Field(default_factory=WorkerConfig)
     service: ServiceConfig
+    openigtlink: OpenIgtLinkConfig = Field(default_factory=OpenIgtLinkConfig)
     bridge: dict[str, Any] = Field(default_factory=dict)
     virtual: dict[str, Any] = Field(default_factory=dict)
 
