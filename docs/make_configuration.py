@@ -9,6 +9,7 @@ from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
 from room_config.load import Config
+from room_config.outputs import Destination
 from room_config.service import AccessToken, GuideConfig
 from simulator.config import VirtualRoom
 
@@ -73,6 +74,7 @@ def render() -> str:
             parts.append(f"\n## `[{name}]`\n\n{_table(field.annotation)}")
     parts.append(f"\n## `[service.guide]`\n\n{GUIDE_TEXT}\n\n{_table(GuideConfig)}")
     parts.append(f"\n## `[[service.token]]`\n\n{_table(AccessToken)}")
+    parts.append(f"\n## `[[outputs.destination]]`\n\n{_table(Destination)}")
     parts.append(_BRIDGE)
     parts.append(
         "\n## `[virtual]`\n\nThe virtual room, for `autospine demo` and `autospine scanner`; its keys "

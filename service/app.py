@@ -19,6 +19,7 @@ from fastapi.openapi.utils import get_openapi
 from fastapi.responses import FileResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.registry import Collector
 
 from room_config.load import Config
 from service.access import Access, AccessRules
@@ -27,12 +28,14 @@ from service.control import ControlLoop
 from service.gate import Gate
 from service.live import Broadcast
 from service.metrics import RoomMetrics
+from service.outbox_watch import OutboxWatch
 from service.problems import Problem, add_problems, problem, responses
 from service.room_link import PumpedClient, RoomLink
 from service.routes_access import access_router
 from service.routes_command import clerk_router, command_router, stop_router
 from service.routes_documents import document_router
 from service.routes_images import measurement_image_router, slice_image_router
+from service.routes_outputs import outbox_router, output_router
 from service.routes_record import live_router, record_router
 
 PAGE = Path(__file__).parent / "page"
@@ -45,19 +48,22 @@ def create_app(config: Config, announce: Callable[[], None] = lambda: None) -> F
     service = config.service
     client = PumpedClient(service.bridge_link, name="service", heartbeat_s=service.heartbeat_s)
     link = RoomLink(client, _log_link)
-    loop = ControlLoop(config, link)
+    outbox = OutboxWatch(config)
+    loop = ControlLoop(config, link, outbox.conditions)
     broadcast = Broadcast(config, loop)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         loop.start()
         broadcast.start()
+        outbox.start()
         announce()
         try:
             yield
         finally:
             await asyncio.to_thread(broadcast.close)
             await asyncio.to_thread(loop.close)
+            await asyncio.to_thread(outbox.close)
 
     app = FastAPI(
         title="AutoSPINe Navigator",
@@ -79,13 +85,15 @@ def create_app(config: Config, announce: Callable[[], None] = lambda: None) -> F
         record_router(case_dir),
         slice_image_router(case_dir),
         measurement_image_router(case_dir),
+        output_router(case_dir),
+        outbox_router(config),
         document_router(case_dir),
         command_router(loop),
         clerk_router(loop),
         access_router(access, uses_tls=uses_tls),
     ):
         app.include_router(router)
-    _add_health(app, loop, link, broadcast)
+    _add_health(app, loop, RoomMetrics(loop, link, broadcast), outbox)
     _add_page(app)
     _describe_api(app)
     return app
@@ -101,9 +109,10 @@ def access_rules(config: Config) -> AccessRules:
     )
 
 
-def _add_health(app: FastAPI, loop: ControlLoop, link: RoomLink, broadcast: Broadcast) -> None:
+def _add_health(app: FastAPI, loop: ControlLoop, *collectors: Collector) -> None:
     registry = CollectorRegistry()
-    registry.register(RoomMetrics(loop, link, broadcast))
+    for collector in collectors:
+        registry.register(collector)
 
     @app.get("/healthz", tags=["health"], responses=responses(503))
     async def health() -> Health:

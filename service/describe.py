@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -49,7 +49,14 @@ _SAME_SLICE_MM = 0.5
 class Describer:
     """Makes the state anew when asked; keeps only what is dear to find out again."""
 
-    def __init__(self, config: Config, record: CaseRecord, link: RoomLink) -> None:
+    def __init__(
+        self,
+        config: Config,
+        record: CaseRecord,
+        link: RoomLink,
+        others_wrong: Callable[[], Sequence[Condition]] = tuple,
+    ) -> None:
+        self._others_wrong = others_wrong
         self._config = config
         self._record = record
         self._link = link
@@ -113,7 +120,7 @@ class Describer:
                 "processes": processes,
             }
         )
-        alarms = self._alarms.update(_conditions(state), record)
+        alarms = self._alarms.update([*_conditions(state), *self._others_wrong()], record)
         state = state.model_copy(update={"alarms": alarms})
         same = state.model_copy(update={"at_s": before.at_s}) == before
         return state.model_copy(update={"revision": before.revision + (not same)})
