@@ -56,6 +56,9 @@ def stamp(dataset: Dataset, finding: Finding, kind: str, description: str) -> No
         setattr(dataset, name, date)
     for name in ("SeriesTime", "ContentTime", "InstanceCreationTime"):
         setattr(dataset, name, time)
+    for equipment in dataset.get("ContributingEquipmentSequence") or ():
+        if "ContributionDateTime" in equipment:
+            equipment.ContributionDateTime = date + time
     dataset.SeriesNumber = SERIES_NUMBERS[kind]
     dataset.SeriesDescription = description[:_DESCRIPTION_CHARACTERS]
     dataset.Manufacturer = MAKER

@@ -107,7 +107,13 @@ def dataset_of(finding: Finding, output: Output) -> Dataset:
 
     if output.kind == "image":
         return image_of(finding)
-    raise OutputError(f"{output.name}: not known")
+    if output.kind == "presentation":
+        from service.output_presentation import presentation_of
+
+        return presentation_of(finding)
+    from service.output_report import report_of
+
+    return report_of(finding)
 
 
 def _finding(record: CaseRecord, output: Output) -> Finding:

@@ -26,6 +26,7 @@ from pynetdicom.sop_class import (
 )
 
 from room_config.load import Config
+from service.outbox_process import serve
 
 SOP_CLASSES = (
     MRImageStorage,
@@ -53,6 +54,10 @@ class Receiver:
         self.received.append((str(event.request.AffectedSOPInstanceUID), encoded))
         return self.answer(number)
 
+    def again(self, number: int) -> bool:
+        """Whether this one had been sent before."""
+        return self.uids[number] in self.uids[:number]
+
     @property
     def uids(self) -> list[str]:
         return [uid for uid, _ in self.received]
@@ -60,15 +65,19 @@ class Receiver:
 
 @contextmanager
 def receiving(
-    port: int = 0, sop_classes: tuple[Any, ...] = SOP_CLASSES, tls: Any = None, **settings: Any
+    port: int = 0,
+    sop_classes: tuple[Any, ...] = SOP_CLASSES,
+    tls: Any = None,
+    implicit_only: bool = False,
+    require_called_aet: bool = False,
 ) -> Iterator[Receiver]:
-    """A pynetdicom receiver on loopback; `settings` are attributes of its AE."""
+    """A pynetdicom receiver on loopback."""
     receiver = Receiver()
     entity = AE(ARCHIVE)
-    for name, value in settings.items():
-        setattr(entity, name, value)
+    entity.require_called_aet = require_called_aet
+    explicit = [] if implicit_only else [ExplicitVRLittleEndian]
     for sop_class in sop_classes:
-        entity.add_supported_context(sop_class, [ExplicitVRLittleEndian, ImplicitVRLittleEndian])
+        entity.add_supported_context(sop_class, [*explicit, ImplicitVRLittleEndian])
     handlers: list[Any] = [(evt.EVT_C_STORE, receiver.store)]
     server = entity.start_server(
         ("127.0.0.1", port), block=False, evt_handlers=handlers, ssl_context=tls
@@ -145,7 +154,7 @@ class OutboxProcess:
     def kill(self) -> None:
         """As `kill -9` does."""
         self.process.kill()
-        self.process.wait()
+        self.end()
 
     def end(self) -> int:
         """As the end of the service does."""
@@ -156,13 +165,26 @@ class OutboxProcess:
 
 
 @contextmanager
-def running_outbox(config: Config, log: Path) -> Iterator[OutboxProcess]:
-    outbox = OutboxProcess(config, log)
+def running_outbox(config: Config) -> Iterator[None]:
+    """The outbox's own main loop in a thread; a process takes seconds to load its libraries."""
+    stop = threading.Event()
+    failures: list[BaseException] = []
+
+    def run() -> None:
+        try:
+            serve(config, stop)
+        except BaseException as error:
+            failures.append(error)
+
+    thread = threading.Thread(target=run, name="outbox")
+    thread.start()
     try:
-        yield outbox
+        yield
     finally:
-        code = outbox.end()
-    assert code == 0, log.read_text()
+        stop.set()
+        thread.join(60.0)
+    assert not failures
+    assert not thread.is_alive()
 
 
 @contextmanager

@@ -1,4 +1,4 @@
-"""A case on disk: real slices of the virtual room, really measured, with an approach around them."""
+"""A case on disk: real slices of the virtual room, really measured, and an approach to READY."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from dicom_listener.slice_rows import header_for_record
 from service.procedures import APPROACH
 from service.steps import HoldShift
 from service.targets import TARGET_SET
-from simulator.config import VirtualRoom
+from simulator.config import SliceProtocol, VirtualRoom
 from sr_engine.worker import measure
 
-ROOM = VirtualRoom()
+ROOM = VirtualRoom(protocol=SliceProtocol(shape=(96, 128)))
 SHIFTS_MM = ((-0.25, -0.25), (-0.25, 0.25), (0.25, -0.25), (0.25, 0.25))
 OFFSET_MM = (0.8, -1.3)
 """Where the target lies from the fiducial, row and column."""
