@@ -8,6 +8,7 @@ from typing import Any
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
 
+from room_config.imaging import PointSpreadConfig
 from room_config.load import Config
 from room_config.outputs import Destination
 from room_config.service import AccessToken, GuideConfig
@@ -72,6 +73,7 @@ def render() -> str:
     for name, field in Config.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
             parts.append(f"\n## `[{name}]`\n\n{_table(field.annotation)}")
+    parts.append(f"\n## `[imaging.point_spread]`\n\n{_table(PointSpreadConfig)}")
     parts.append(f"\n## `[service.guide]`\n\n{GUIDE_TEXT}\n\n{_table(GuideConfig)}")
     parts.append(f"\n## `[[service.token]]`\n\n{_table(AccessToken)}")
     parts.append(f"\n## `[[outputs.destination]]`\n\n{_table(Destination)}")

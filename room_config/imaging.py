@@ -1,10 +1,38 @@
 """`[imaging]`: what a usable slice looks like, and the fiducial in it."""
 
-from typing import Literal
+from typing import Annotated, Literal
 
 from pydantic import Field, model_validator
 
 from room_config.section import Section
+
+Fraction = Annotated[float, Field(gt=0, le=1)]
+_PARAMETERS = {"flat": 0, "hamming": 1, "fermi": 2, "elliptical": 0}
+
+
+class PointSpreadConfig(Section):
+    """`[imaging.point_spread]`: the filter that the scanner lays over k-space."""
+
+    kind: Literal["flat", "hamming", "fermi", "elliptical"]
+    parameters: tuple[float, ...] = Field(
+        default=(),
+        description="hamming: alpha; fermi: cutoff and width, in units of the highest frequency; "
+        "empty: the usual ones.",
+    )
+    acquired: tuple[Fraction, Fraction] = Field(
+        default=(1.0, 1.0),
+        description="Share of k-space (along rows, along columns) that is really sampled, where "
+        "the scanner fills the rest with zeros.",
+    )
+
+    @model_validator(mode="after")
+    def _complete(self) -> "PointSpreadConfig":
+        wanted = _PARAMETERS[self.kind]
+        if self.parameters and len(self.parameters) != wanted:
+            raise ValueError(
+                f"{self.kind} takes {wanted} parameters, {len(self.parameters)} are given"
+            )
+        return self
 
 
 class ImagingConfig(Section):
@@ -32,7 +60,11 @@ class ImagingConfig(Section):
         gt=0,
         description="A fiducial further than this from its predicted position is not believed.",
     )
-
+    point_spread: PointSpreadConfig | None = Field(
+        default=None,
+        description="The filter of the slices; absent: recognised for each series in the noise of "
+        "its first slice.",
+    )
     readout_polarity: Literal[-1, 0, 1] = Field(
         default=0,
         description="Where oil appears: 1 displaced towards growing pixel indices along the "

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from room_config.imaging import ImagingConfig
 from room_config.listener import ListenerConfig
+from room_config.openigtlink import OpenIgtLinkConfig
 from room_config.outputs import OutputsConfig
 from room_config.room import RoomConfig
 from room_config.service import ServiceConfig
@@ -43,6 +44,7 @@ class Config(BaseModel):
     worker: WorkerConfig = Field(default_factory=WorkerConfig)
     service: ServiceConfig
     outputs: OutputsConfig = Field(default_factory=OutputsConfig)
+    openigtlink: OpenIgtLinkConfig = Field(default_factory=OpenIgtLinkConfig)
     bridge: dict[str, Any] = Field(default_factory=dict)
     virtual: dict[str, Any] = Field(default_factory=dict)
 

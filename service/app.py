@@ -7,6 +7,7 @@ is the exception and goes onto the line at once. Errors are RFC 9457 problem det
 from __future__ import annotations
 
 import asyncio
+import socket
 import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
@@ -26,6 +27,7 @@ from service.access import Access, AccessRules
 from service.bodies import Health
 from service.control import ControlLoop
 from service.gate import Gate
+from service.igtl_server import OpenIgtLinkServer
 from service.live import Broadcast
 from service.metrics import RoomMetrics
 from service.outbox_watch import OutboxWatch
@@ -43,24 +45,35 @@ _HOUR_S = 3600.0
 _LOOP_IS_OLD_S = 3.0
 
 
-def create_app(config: Config, announce: Callable[[], None] = lambda: None) -> FastAPI:
-    """Wire the service of one room; `announce` is called when it is ready to serve."""
+def create_app(
+    config: Config,
+    announce: Callable[[], None] = lambda: None,
+    scene: socket.socket | None = None,
+) -> FastAPI:
+    """Wire the service of one room; `announce` is called when it is ready to serve.
+
+    scene: on which receivers of OpenIGTLink connect.
+    """
     service = config.service
     client = PumpedClient(service.bridge_link, name="service", heartbeat_s=service.heartbeat_s)
     link = RoomLink(client, _log_link)
     outbox = OutboxWatch(config)
     loop = ControlLoop(config, link, outbox.conditions)
     broadcast = Broadcast(config, loop)
+    receivers = OpenIgtLinkServer(config.openigtlink, config.room.case_dir, loop)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         loop.start()
         broadcast.start()
         outbox.start()
+        if scene is not None:
+            await receivers.start(scene)
         announce()
         try:
             yield
         finally:
+            await receivers.close()
             await asyncio.to_thread(broadcast.close)
             await asyncio.to_thread(loop.close)
             await asyncio.to_thread(outbox.close)
@@ -93,7 +106,7 @@ def create_app(config: Config, announce: Callable[[], None] = lambda: None) -> F
         access_router(access, uses_tls=uses_tls),
     ):
         app.include_router(router)
-    _add_health(app, loop, RoomMetrics(loop, link, broadcast), outbox)
+    _add_health(app, loop, RoomMetrics(loop, link, broadcast, receivers), outbox)
     _add_page(app)
     _describe_api(app)
     return app

@@ -8,15 +8,23 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 from service.control import ControlLoop
+from service.igtl_server import OpenIgtLinkServer
 from service.live import Broadcast
 from service.room_link import RoomLink
 
 
 class RoomMetrics(Collector):
-    def __init__(self, loop: ControlLoop, link: RoomLink, broadcast: Broadcast) -> None:
+    def __init__(
+        self,
+        loop: ControlLoop,
+        link: RoomLink,
+        broadcast: Broadcast,
+        receivers: OpenIgtLinkServer,
+    ) -> None:
         self._loop = loop
         self._link = link
         self._broadcast = broadcast
+        self._receivers = receivers
 
     def collect(self) -> Iterator[GaugeMetricFamily]:
         state = self._loop.state
@@ -25,6 +33,11 @@ class RoomMetrics(Collector):
         )
         yield GaugeMetricFamily(
             "autospine_viewers", "Open event streams.", value=float(self._broadcast.viewers)
+        )
+        yield GaugeMetricFamily(
+            "autospine_openigtlink_receivers",
+            "Connected receivers of the scene.",
+            value=float(self._receivers.receivers),
         )
         parts = GaugeMetricFamily(
             "autospine_process_up", "1 while a process of the room works.", labels=["process"]

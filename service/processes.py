@@ -27,6 +27,7 @@ _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> None:
     """Page, API, procedure, planner."""
     from service.app import create_app
+    from service.igtl_server import bind_openigtlink
 
     configure_logs()
     room = load_config(config)
@@ -35,7 +36,11 @@ def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> Non
     host, port = listening.getsockname()[:2]
     scheme = "http" if room.service.tls_certificate is None else "https"
     url = f"{scheme}://{f'[{host}]' if ':' in host else host}:{port}"
-    app = create_app(room, announce=lambda: announce({"url": url}))
+    ready: dict[str, object] = {"url": url}
+    scene = bind_openigtlink(room.openigtlink)
+    if scene is not None:
+        ready["openigtlink"] = "{}:{}".format(*scene.getsockname()[:2])
+    app = create_app(room, announce=lambda: announce(ready), scene=scene)
     # the control loop must not wait long for the interpreter while a page is being served
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     server = uvicorn.Server(

@@ -26,10 +26,12 @@ from service.steps import outcome_from_json
 from sr_engine.errors import EngineError
 from sr_engine.worker import (
     Frames,
+    PointSpreads,
     UnusableSlicesError,
     describe_result,
     gather_frames,
     localize_request,
+    recorded_point_spread,
 )
 
 app = typer.Typer(add_completion=False)
@@ -137,19 +139,23 @@ def _agrees(row: Procedure, ended: str) -> bool:
 
 def replay_measurements(record: CaseRecord, method: str | None) -> Iterator[ReplayedMeasurement]:
     """Make every measurement again, in order; `method` None: by the recorded method."""
+    psfs = PointSpreads()
     for row in record.measurements():
         if row.state != "requested":
-            yield _replay_one(record, row, method or row.method)
+            yield _replay_one(record, row, method or row.method, psfs)
 
 
-def _replay_one(record: CaseRecord, row: Measurement, method: str) -> ReplayedMeasurement:
+def _replay_one(
+    record: CaseRecord, row: Measurement, method: str, psfs: PointSpreads
+) -> ReplayedMeasurement:
     recorded = None if row.result is None else np.array(row.result["plane_mm"])
     frames, reason = 0, ""
     replayed = sigma = None
     try:
         taken = _frames_then(gather_frames(record, row), row)
         frames = len(taken.pixels)
-        found = describe_result(taken, localize_request(taken, method, row.request))
+        psf = recorded_point_spread(row.result) or psfs.of(taken)
+        found = describe_result(taken, localize_request(taken, method, row.request, psf))
         replayed = np.array(found["plane_mm"])
         sigma = float(np.sqrt(np.trace(np.array(found["covariance_mm2"])) / 2))
     except (EngineError, UnusableSlicesError, UnusableError) as error:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -22,6 +22,7 @@ from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
 from dicom_listener.pixels import magnitude_pixels
 from dicom_listener.reasons import UnusableError
+from room_config.imaging import PointSpreadConfig
 from room_config.load import Config
 from sr_engine.checks import refuse_non_square
 from sr_engine.errors import (
@@ -43,8 +44,6 @@ ALIVE = "worker.alive"
 _SAME_PLACE = 1e-6
 _SAME_SLICE_MM = 0.5
 log = structlog.get_logger()
-
-PointSpreads = dict[tuple[str, tuple[int, int]], Psf]  # by series and size of its slices
 
 
 class UnusableSlicesError(Exception):
@@ -68,12 +67,33 @@ class Frames:
     slices: tuple[SliceRow, ...]
 
 
+class PointSpreads:
+    """The point spread of any slices: the configured one, or recognised once for each series."""
+
+    def __init__(self, configured: PointSpreadConfig | None = None) -> None:
+        self._configured = None
+        if configured is not None:
+            self._configured = Psf(configured.kind, configured.parameters, configured.acquired)
+        self._recognised: dict[tuple[str, tuple[int, int]], Psf] = {}
+
+    def of(self, frames: Frames) -> Psf:
+        """Recognised in the noise of the first frame that is seen of a series."""
+        if self._configured is not None:
+            return self._configured
+        series = str(frames.slices[0].header.get("series_instance_uid", ""))
+        key = (series, frames.geometry.shape)
+        if key not in self._recognised:
+            psf = self._recognised[key] = psf_of_noise(frames.pixels[0])
+            log.info("point spread", series=series, kind=psf.kind, acquired=psf.acquired)
+        return self._recognised[key]
+
+
 def serve(config: Config, should_stop: Callable[[], bool]) -> None:
     """Work until `should_stop`; looks for requests every `poll_s`, says every second: alive."""
     case_dir = config.room.case_dir
     alive = case_dir / ALIVE
     said_s = 0.0
-    psfs: PointSpreads = {}
+    psfs = PointSpreads(config.imaging.point_spread)
     with CaseRecord(case_dir, create=True) as record, Presence(case_dir, "worker") as presence:
         while not should_stop():
             presence.beat()
@@ -88,16 +108,14 @@ def serve(config: Config, should_stop: Callable[[], bool]) -> None:
 def measure(
     record: CaseRecord, request: Measurement, factor: int, psfs: PointSpreads | None = None
 ) -> None:
-    """Carry out one requested measurement and record its result, or why there is none.
-
-    psfs: point spreads of the series seen so far, each recognised once; added to.
-    """
+    """Carry out one requested measurement and record its result, or why there is none."""
     number = request.measurement_id
     try:
         frames = gather_frames(record, request)
-        psf = point_spread(frames, {} if psfs is None else psfs)
+        psf = (psfs or PointSpreads()).of(frames)
         found = localize_request(frames, request.method, request.request, psf)
         result = describe_result(frames, found)
+        result["point_spread"] = asdict(psf)
         result["reconstruction"] = _reconstruction(record.case_dir, number, frames, factor)
     except (EngineError, UnusableSlicesError, UnusableError) as error:
         with record.transaction():
@@ -137,14 +155,12 @@ def gather_frames(record: CaseRecord, request: Measurement) -> Frames:
     return Frames(np.array(pixels), shifts_px, geometry, tuple(slices))
 
 
-def point_spread(frames: Frames, psfs: PointSpreads) -> Psf:
-    """The point spread of the slices' series, recognised in the noise of the first one seen."""
-    first = frames.slices[0].header
-    key = (str(first.get("series_instance_uid", "")), frames.geometry.shape)
-    if key not in psfs:
-        psfs[key] = psf_of_noise(frames.pixels[0])
-        log.info("point spread", series=key[0], kind=psfs[key].kind, acquired=psfs[key].acquired)
-    return psfs[key]
+def recorded_point_spread(result: Mapping[str, Any] | None) -> Psf | None:
+    """What a recorded measurement was made with; None where its record does not say."""
+    recorded = (result or {}).get("point_spread")
+    if recorded is None:
+        return None
+    return Psf(recorded["kind"], tuple(recorded["parameters"]), tuple(recorded["acquired"]))
 
 
 def is_at_position(row: SliceRow, slice_position_mm: float | None) -> bool:

@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 from room_config.load import ConfigError, load_config
+from sr_engine.psf import Psf
 
 MINIMAL = """
 [room]
@@ -43,6 +44,18 @@ def test_the_environment_overrides_the_file(tmp_path):
         (MINIMAL + "tolerance_mm = nan", "key service.tolerance_mm"),
         (MINIMAL + "[listner]\nport = 1", "unknown key listner .*listener"),
         (MINIMAL + "tolerance_mm =", "not valid TOML"),
+        (
+            MINIMAL + "[imaging.point_spread]\nkind = 'fermi'\nparameters = [0.9]",
+            "key imaging.point_spread: .*fermi takes 2 parameters, 1 are given",
+        ),
+        (
+            MINIMAL + "[imaging.point_spread]\nkind = 'sinc'",
+            "key imaging.point_spread.kind: .*'hamming'",
+        ),
+        (
+            MINIMAL + "[imaging.point_spread]\nkind = 'flat'\nacquired = [1.5, 1.0]",
+            "key imaging.point_spread.acquired.0: .*got 1.5",
+        ),
     ],
 )
 def test_a_wrong_key_is_named_with_its_file(tmp_path, text, expected):
@@ -55,3 +68,10 @@ def test_a_wrong_key_is_named_with_its_file(tmp_path, text, expected):
 def test_a_missing_file_is_named(tmp_path):
     with pytest.raises(ConfigError, match=r"nothing\.toml"):
         load_config(tmp_path / "nothing.toml", {})
+
+
+@pytest.mark.parametrize("kind", ["flat", "hamming", "fermi", "elliptical"])
+def test_every_configurable_point_spread_is_one_of_the_engines(tmp_path, kind):
+    text = MINIMAL + f"[imaging.point_spread]\nkind = '{kind}'"
+    configured = load_config(config_file(tmp_path, text), {}).imaging.point_spread
+    assert Psf(configured.kind, configured.parameters, configured.acquired).kind == kind

@@ -29,6 +29,13 @@ bridge_link = "{os.ttyname(_NEAR_END)}"
 @contextmanager
 def running_service(folder: Path, more: str = "") -> Iterator[str]:
     """The URL of a service whose `[service]` table goes on with `more`."""
+    with ready_service(folder, more) as ready:
+        yield ready["url"]
+
+
+@contextmanager
+def ready_service(folder: Path, more: str = "") -> Iterator[dict[str, str]]:
+    """What such a service says when it is ready."""
     config = folder / "room.toml"
     config.write_text(CONFIG + more)
     log = folder / "service.log"
@@ -43,7 +50,7 @@ def running_service(folder: Path, more: str = "") -> Iterator[str]:
         assert process.stdout is not None
         line = process.stdout.readline()
         assert line, log.read_text()
-        yield str(json.loads(line)["url"])
+        yield json.loads(line)
     finally:
         process.communicate()
         assert process.returncode == 0, log.read_text()

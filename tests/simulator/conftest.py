@@ -44,6 +44,7 @@ def page() -> Iterator[Page]:
             self.send_header("Content-Length", str(len(body)))
             self.end_headers()
             self.wfile.write(body)
+            page.answered += 1
 
         def log_message(self, format: str, *args: Any) -> None:
             pass

@@ -15,6 +15,13 @@ from simulator.config import VirtualRoom
 Start = Callable[..., "Running"]
 
 
+def wait_until(condition: Callable[[], bool], what: str, timeout_s: float = 60.0) -> None:
+    deadline_s = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < deadline_s, f"waited {timeout_s:.0f} s in vain: {what}"
+        time.sleep(0.01)
+
+
 @dataclass
 class Stages:
     """Stage positions over time; `go` moves on a straight line in `duration_s`."""
@@ -61,6 +68,12 @@ class Page:
     url: str = ""
     state: dict[str, Any] = field(default_factory=lambda: {"acquisition_request": None})
     status: int = 200
+    answered: int = 0
+
+    def wait_until_asked(self, times: int = 5) -> None:
+        """Until the scanner has seen the present state, that many times."""
+        wanted = self.answered + times + 1  # the first may have been under way
+        wait_until(lambda: self.answered >= wanted, "the scanner asks")
 
     def ask_for(self, request_id: str, hold_id: int = 1, count: int = 1, **more: Any) -> None:
         request = {"request_id": request_id, "hold_id": hold_id, "count": count, **more}
@@ -77,10 +90,7 @@ class Receiver:
     statuses: list[int] = field(default_factory=list)
 
     def wait_for(self, count: int, timeout_s: float = 60.0) -> list[Dataset]:
-        deadline_s = time.monotonic() + timeout_s
-        while len(self.arrived) < count:
-            assert time.monotonic() < deadline_s, f"{len(self.arrived)} of {count} slices arrived"
-            time.sleep(0.01)
+        wait_until(lambda: len(self.arrived) >= count, f"{count} slices", timeout_s)
         return self.arrived
 
     def start(self, port: int = 0) -> Any:
@@ -118,8 +128,8 @@ class Running:
         return [line for line in lines if line["kind"] == kind]
 
     def wait_for_truth(self, count: int, kind: str = "acquisition") -> list[dict[str, Any]]:
-        deadline_s = time.monotonic() + 60
-        while len(self.truth(kind)) < count:
-            assert time.monotonic() < deadline_s, f"{self.truth(kind)}, {self.notes}"
-            time.sleep(0.01)
+        wait_until(lambda: len(self.truth(kind)) >= count, f"{count} of {kind} in the truth")
         return self.truth(kind)
+
+    def wait_for_note(self, text: str) -> None:
+        wait_until(lambda: any(text in note for note in self.notes), f"a note of {text}")

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 import pytest
 import serial
-from neighbours import Page, Receiver
+from neighbours import Page, Receiver, wait_until
 
 from simulator.config import parse_virtual_room
 from simulator.scan_operator import operate
@@ -35,6 +35,12 @@ def motors(folder: Path) -> Iterator[dict[str, Any]]:
             process.terminate()
 
 
+def _answer(line: serial.Serial, question: bytes) -> bytes:
+    line.reset_input_buffer()
+    line.write(question)
+    return bytes(line.read_until(b"\r"))
+
+
 def test_what_the_motors_do_is_what_the_scanner_sees(
     tmp_path: Path, page: Page, receiver: Receiver
 ) -> None:
@@ -46,7 +52,7 @@ def test_what_the_motors_do_is_what_the_scanner_sees(
             "listener_port": receiver.port,
             "motors_truth_port": address.port,
             "truth_file": str(tmp_path / "truth.jsonl"),
-            "acquisition_s": 0.2,
+            "acquisition_s": 0.8,
             "poll_s": 0.01,
         }
         room = parse_virtual_room({"scanner": table})
@@ -57,8 +63,8 @@ def test_what_the_motors_do_is_what_the_scanner_sees(
             page.ask_for("standing")
             receiver.wait_for(1)
             line.write(b"X1M2\r")
-            time.sleep(0.2)  # until the controller has unparked
-            line.write(b"X1J1000,0,1000\r")  # about 4.4 mm in a second
+            wait_until(lambda: _answer(line, b"X1M\r") == b"X1M:2\r", "unparked")
+            line.write(b"X1J1000,0,250\r")  # about 4.4 mm in four seconds
             while ask_where(address).positions_mm["xt"] < 0.1:
                 time.sleep(0.005)
             page.ask_for("moving")

@@ -181,13 +181,14 @@ def test_motion_during_scan_is_an_acquisition_that_nobody_asked_for(
     start: Start, stages: Stages, page: Page, receiver: Receiver
 ) -> None:
     running = start(faults=["motion_during_scan"], **ALWAYS)
-    time.sleep(0.2)
+    page.wait_until_asked()
     assert running.truth() == []
     stages.go(0.5, xt=6.0, yt=0.0)
     running.wait_for_truth(2)
-    time.sleep(0.7)
+    time.sleep(0.5)  # the motion itself
+    page.wait_until_asked(10)
     stopped = len(running.truth())
-    time.sleep(0.2)
+    page.wait_until_asked(20)
     truth = running.truth()
     assert len(truth) == stopped, "it ends with the motion"
     assert all(line["request_id"] is None for line in truth)

@@ -77,7 +77,7 @@ def test_a_request_is_served_once_and_the_next_one_at_the_new_position(
     running = start()
     page.ask_for("r1")
     receiver.wait_for(1)
-    time.sleep(0.3)
+    page.wait_until_asked(10)
     assert len(receiver.arrived) == 1
     stages.stand(xt=10.0, yt=0.0)
     page.ask_for("r2", hold_id=2)
@@ -121,12 +121,11 @@ def test_the_scanners_clock_is_ours_plus_its_offset_and_reads_local_time(
 def test_a_slice_taken_while_the_stages_move_is_marked_so_in_the_truth_and_is_smeared(
     start: Start, stages: Stages, page: Page, receiver: Receiver
 ) -> None:
-    running = start({"acquisition_s": 0.2})
+    running = start({"acquisition_s": 1.0})
     page.ask_for("r1")
     receiver.wait_for(1)
-    stages.go(0.6, xt=5.0, yt=5.0)
-    time.sleep(0.1)
     page.ask_for("r2")
+    stages.go(3.0, xt=5.0, yt=5.0)
     slices = receiver.wait_for(2)
     truth = running.wait_for_truth(2)
     assert truth[0]["travel_mm"] == 0
@@ -169,14 +168,14 @@ def test_dcmtks_storescp_takes_the_slices(
 def test_what_cannot_be_delivered_is_tried_again_in_order_until_somebody_listens(
     start: Start, page: Page, receiver: Receiver
 ) -> None:
-    free = Receiver()
-    server = free.start()
-    port = free.port
-    server.shutdown()
-    running = start({"listener_port": port})
-    page.ask_for("r1", count=2)
+    with socket.create_server(("127.0.0.1", 0)) as hangs_up:
+        hangs_up.settimeout(60)
+        port = hangs_up.getsockname()[1]
+        running = start({"listener_port": port})
+        page.ask_for("r1", count=2)
+        hangs_up.accept()[0].close()
     running.wait_for_truth(2)
-    time.sleep(0.3)
+    free = Receiver()
     server = free.start(port)
     try:
         arrived = free.wait_for(2)
@@ -209,16 +208,15 @@ def test_a_service_that_cannot_be_understood_is_reported_once_and_asked_again(
 ) -> None:
     page.state = {"phase": "TARGETING"}
     running = start()
-    time.sleep(0.2)
+    page.wait_until_asked()
     assert [note for note in running.notes if "acquisition_request" in note] == [
         f"{page.url}: the state has no field 'acquisition_request'"
     ]
     page.status = 503
-    time.sleep(0.2)
+    page.wait_until_asked()
     page.status = 200
     page.ask_for("r1", count=0)
-    time.sleep(0.2)
-    assert any("acquisition_request.count" in note for note in running.notes)
+    running.wait_for_note("acquisition_request.count")
     page.ask_for("r1")
     receiver.wait_for(1)
 
@@ -227,9 +225,9 @@ def test_without_any_truth_nothing_is_acquired(start: Start, page: Page) -> None
     with _unused_port() as port:
         running = start({"motors_truth_port": port})
         page.ask_for("r1")
-        time.sleep(0.4)
+        running.wait_for_note(f"truth at 127.0.0.1:{port}")
+        page.wait_until_asked()
         assert running.truth() == []
-        assert any(f"truth at 127.0.0.1:{port}" in note for note in running.notes)
 
 
 def test_a_second_run_appends_to_the_truth_and_does_not_repeat_the_noise(
