@@ -8,6 +8,7 @@ from pydicom.dataset import Dataset
 from service.derived import derived_image
 from service.finding import Finding
 from service.output_identity import output_uid, series_uid, stamp
+from service.output_source import tidy_patient
 from service.outputs import OutputError
 from sr_engine.frames import whole
 from sr_engine.geometry import SliceGeometry
@@ -26,6 +27,7 @@ def image_of(finding: Finding) -> Dataset:
         raise OutputError(f"measurement {number} has no reconstruction")
     made = _reconstruction(finding)
     dataset = derived_image(made, fine_geometry(finding, made.factor), finding.files)
+    tidy_patient(dataset)
     name = f"measurement-{number}-image"
     dataset.SOPInstanceUID = output_uid(finding, name)
     dataset.file_meta.MediaStorageSOPInstanceUID = dataset.SOPInstanceUID

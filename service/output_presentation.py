@@ -12,7 +12,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import pydicom
 from highdicom.pr import (
     GraphicAnnotation,
     GraphicLayer,
@@ -36,6 +35,7 @@ from service.output_identity import (
     subject_of,
 )
 from service.output_image import fine_geometry, has_image, image_of
+from service.output_source import source_of
 
 FIDUCIAL = GraphicLayer("FIDUCIAL", 1, "Where the fiducial was measured")
 TARGET = GraphicLayer("TARGET", 2, "Where the fiducial is to be")
@@ -71,7 +71,7 @@ def presentation_of(finding: Finding) -> Dataset:
     drawing = _drawing(finding)
     subject, number = subject_of(finding)
     image = drawing.image
-    words = (str(image.StudyInstanceUID), str(image.FrameOfReferenceUID))
+    words = (str(image.StudyInstanceUID), str(image.get("FrameOfReferenceUID", "")))
     made = GrayscaleSoftcopyPresentationState(
         referenced_images=[image],
         series_instance_uid=series_uid(finding, "presentation", *words),
@@ -106,7 +106,7 @@ def _drawing(finding: Finding) -> Drawing:
         geometry = fine_geometry(finding, factor)
         centre_px = geometry.pixel_from_patient(finding.result["patient_mm"])[0]
     else:
-        image = pydicom.dcmread(finding.files[finding.shown])
+        image = source_of(finding, finding.shown)
         many = int(image.get("NumberOfFrames") or 1) > 1
         frame = finding.slices[finding.shown].frame + 1 if many else None
         geometry = finding.geometry

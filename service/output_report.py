@@ -10,7 +10,6 @@ from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
-import pydicom
 from highdicom.sr import (
     AlgorithmIdentification,
     CodedConcept,
@@ -43,25 +42,24 @@ from service.output_identity import (
     subject_of,
 )
 from service.output_image import has_image, image_of
+from service.output_source import frame_of_reference, source_of
 
 _DIGITS = 6
 
 
 def report_of(finding: Finding) -> Dataset:
     """The report; the same for the same record."""
-    evidence = [pydicom.dcmread(path, stop_before_pixels=True) for path in finding.files]
+    evidence = [source_of(finding, index) for index in range(len(finding.files))]
     if has_image(finding):
         evidence.append(image_of(finding))
     first = evidence[0]
-    frame_of_reference = str(first.FrameOfReferenceUID)
+    place = frame_of_reference(first)
     subject, number = subject_of(finding)
-    content = _content(finding, evidence, frame_of_reference)
+    content = _content(finding, evidence, place)
     made = Comprehensive3DSR(
         evidence=evidence,
         content=content[0],
-        series_instance_uid=series_uid(
-            finding, "report", str(first.StudyInstanceUID), frame_of_reference
-        ),
+        series_instance_uid=series_uid(finding, "report", str(first.StudyInstanceUID), place),
         series_number=SERIES_NUMBERS["report"],
         sop_instance_uid=output_uid(finding, f"{subject}-{number}-report"),
         # measurements, approaches and punctures are numbered each by themselves
@@ -75,9 +73,8 @@ def report_of(finding: Finding) -> Dataset:
     return made
 
 
-def _content(
-    finding: Finding, evidence: list[Dataset], frame_of_reference: str
-) -> MeasurementReport:
+def _content(finding: Finding, evidence: list[Dataset], place: str) -> MeasurementReport:
+    """place: UID of the frame of reference."""
     device = DeviceObserverIdentifyingAttributes(
         uid=output_uid(finding, "device"),
         name=MAKER,
@@ -90,14 +87,14 @@ def _content(
     return MeasurementReport(
         observation_context=ObservationContext(observer_device_context=observer),
         procedure_reported=concept.PROCEDURE,
-        imaging_measurements=[_group(finding, evidence, frame_of_reference)],
+        imaging_measurements=[_group(finding, evidence, place)],
         title=concept.REPORT_TITLE,
         referenced_images=evidence,
     )
 
 
 def _group(
-    finding: Finding, evidence: list[Dataset], frame_of_reference: str
+    finding: Finding, evidence: list[Dataset], place: str
 ) -> MeasurementsAndQualitativeEvaluations:
     subject, number = subject_of(finding)
     group = MeasurementsAndQualitativeEvaluations(
@@ -108,7 +105,7 @@ def _group(
         method=concept.method(finding.measurement.method),
         algorithm_id=AlgorithmIdentification(name=MAKER, version=software_version()),
         measurements=[
-            *_place(finding, frame_of_reference),
+            *_centre(finding, place),
             *_quality(finding),
             *_target(finding),
         ],
@@ -125,15 +122,15 @@ def _group(
     return group
 
 
-def _place(finding: Finding, frame_of_reference: str) -> Iterator[Measurement]:
+def _centre(finding: Finding, place: str) -> Iterator[Measurement]:
     centre_mm = np.array(finding.result["patient_mm"], dtype=float)
-    point = CoordinatesForMeasurement3D("POINT", centre_mm[None, :], frame_of_reference)
+    point = CoordinatesForMeasurement3D("POINT", centre_mm[None, :], place)
     for name, value in zip(concept.CENTRE, centre_mm, strict=True):
         yield _number(name, value, concept.MILLIMETRE, referenced_coordinates=[point])
     sigmas_mm = np.sqrt(np.diag(np.array(finding.result["covariance_mm2"])))
     for name, value in zip(concept.CENTRE_ALONG, sigmas_mm, strict=True):
         yield _number(name, value, concept.MILLIMETRE, derivation=concept.STANDARD_DEVIATION)
-    circle = CoordinatesForMeasurement3D("ELLIPSE", _circle(finding), frame_of_reference)
+    circle = CoordinatesForMeasurement3D("ELLIPSE", _circle(finding), place)
     yield _number(
         concept.RADIUS, finding.radius_mm, concept.MILLIMETRE, referenced_coordinates=[circle]
     )

@@ -91,12 +91,17 @@ def make_output(record: CaseRecord, output: Output) -> Path:
     path = output.path(record.case_dir)
     if path.is_file():
         return path
+    buffer = io.BytesIO()
     try:
         dataset = dataset_of(_finding(record, output), output)
+        dataset.save_as(buffer, enforce_file_format=True)
+    except OutputError:
+        raise
     except KeyError as error:
         raise OutputError(f"{output.name}: the record has no {error}") from error
-    buffer = io.BytesIO()
-    dataset.save_as(buffer, enforce_file_format=True)
+    except (AttributeError, TypeError, ValueError) as error:
+        # so highdicom and pydicom say that a source's header cannot be used
+        raise OutputError(f"{output.name}: {error}") from error
     _write_once(path, buffer.getvalue())
     return path
 
