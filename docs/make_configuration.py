@@ -10,6 +10,7 @@ from pydantic_core import PydanticUndefined
 
 from room_config.imaging import PointSpreadConfig
 from room_config.load import Config
+from room_config.outputs import Destination
 from room_config.service import AccessToken, GuideConfig
 from simulator.config import VirtualRoom
 
@@ -75,6 +76,7 @@ def render() -> str:
     parts.append(f"\n## `[imaging.point_spread]`\n\n{_table(PointSpreadConfig)}")
     parts.append(f"\n## `[service.guide]`\n\n{GUIDE_TEXT}\n\n{_table(GuideConfig)}")
     parts.append(f"\n## `[[service.token]]`\n\n{_table(AccessToken)}")
+    parts.append(f"\n## `[[outputs.destination]]`\n\n{_table(Destination)}")
     parts.append(_BRIDGE)
     parts.append(
         "\n## `[virtual]`\n\nThe virtual room, for `autospine demo` and `autospine scanner`; its keys "

@@ -18,6 +18,7 @@ from pydantic import BaseModel, ConfigDict, Field, ValidationError
 from room_config.imaging import ImagingConfig
 from room_config.listener import ListenerConfig
 from room_config.openigtlink import OpenIgtLinkConfig
+from room_config.outputs import OutputsConfig
 from room_config.room import RoomConfig
 from room_config.service import ServiceConfig
 from room_config.worker import WorkerConfig
@@ -42,6 +43,7 @@ class Config(BaseModel):
     listener: ListenerConfig = Field(default_factory=ListenerConfig)
     worker: WorkerConfig = Field(default_factory=WorkerConfig)
     service: ServiceConfig
+    outputs: OutputsConfig = Field(default_factory=OutputsConfig)
     openigtlink: OpenIgtLinkConfig = Field(default_factory=OpenIgtLinkConfig)
     bridge: dict[str, Any] = Field(default_factory=dict)
     virtual: dict[str, Any] = Field(default_factory=dict)
@@ -56,9 +58,11 @@ def load_config(path: Path, environment: Mapping[str, str] = os.environ) -> Conf
     except ValidationError as error:
         raise ConfigError(f"{path}: {_first_error(error)}") from None
     sections = {name: getattr(config, name) for name in ("room", "listener", "service")}
-    return config.model_copy(
-        update={name: _absolute(section, path.parent) for name, section in sections.items()}
-    )
+    here = path.parent
+    update: dict[str, BaseModel] = {n: _absolute(section, here) for n, section in sections.items()}
+    sent_to = [_absolute(one, here) for one in config.outputs.destination]
+    update["outputs"] = config.outputs.model_copy(update={"destination": sent_to})
+    return config.model_copy(update=update)
 
 
 def _absolute(section: Model, folder: Path) -> Model:

@@ -20,6 +20,7 @@ from fastapi.openapi.utils import get_openapi
 from fastapi.responses import FileResponse
 from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, generate_latest
+from prometheus_client.registry import Collector
 
 from room_config.load import Config
 from service.access import Access, AccessRules
@@ -30,6 +31,7 @@ from service.igtl_server import OpenIgtLinkServer
 from service.live import Broadcast
 from service.metrics import RoomMetrics
 from service.orders import Orders
+from service.outbox_watch import OutboxWatch
 from service.problems import Problem, add_problems, problem, responses
 from service.room_link import PumpedClient, RoomLink
 from service.routes_access import access_router
@@ -37,6 +39,7 @@ from service.routes_clerk import clerk_router
 from service.routes_documents import document_router
 from service.routes_images import measurement_image_router, slice_image_router
 from service.routes_live import live_router
+from service.routes_outputs import outbox_router, output_router
 from service.routes_procedure import procedure_router
 from service.routes_record import event_router, measurement_router, slice_router
 from service.routes_robot import robot_router, stop_router
@@ -59,7 +62,8 @@ def create_app(
     service = config.service
     client = PumpedClient(service.bridge_link, name="service", heartbeat_s=service.heartbeat_s)
     link = RoomLink(client, _log_link)
-    loop = ControlLoop(config, link)
+    outbox = OutboxWatch(config)
+    loop = ControlLoop(config, link, outbox.conditions)
     broadcast = Broadcast(config, loop)
     receivers = OpenIgtLinkServer(config.openigtlink, config.room.case_dir, loop)
 
@@ -67,6 +71,7 @@ def create_app(
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         loop.start()
         broadcast.start()
+        outbox.start()
         if scene is not None:
             await receivers.start(scene)
         announce()
@@ -76,6 +81,7 @@ def create_app(
             await receivers.close()
             await asyncio.to_thread(broadcast.close)
             await asyncio.to_thread(loop.close)
+            await asyncio.to_thread(outbox.close)
 
     app = FastAPI(
         title="AutoSPINe Navigator",
@@ -99,6 +105,8 @@ def create_app(
         measurement_router(case_dir),
         slice_image_router(case_dir),
         measurement_image_router(case_dir),
+        output_router(case_dir),
+        outbox_router(config),
         document_router(case_dir),
         robot_router(orders),
         target_router(orders),
@@ -107,7 +115,7 @@ def create_app(
         access_router(access, uses_tls=uses_tls),
     ):
         app.include_router(router)
-    _add_health(app, RoomMetrics(loop, link, broadcast, receivers), loop)
+    _add_health(app, loop, RoomMetrics(loop, link, broadcast, receivers), outbox)
     _add_page(app)
     _describe_api(app)
     return app
@@ -123,9 +131,10 @@ def access_rules(config: Config) -> AccessRules:
     )
 
 
-def _add_health(app: FastAPI, metrics_of_room: RoomMetrics, loop: ControlLoop) -> None:
+def _add_health(app: FastAPI, loop: ControlLoop, *collectors: Collector) -> None:
     registry = CollectorRegistry()
-    registry.register(metrics_of_room)
+    for collector in collectors:
+        registry.register(collector)
 
     @app.get("/healthz", tags=["health"], responses=responses(503))
     async def health() -> Health:

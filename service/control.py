@@ -10,7 +10,7 @@ from __future__ import annotations
 import queue
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
@@ -20,6 +20,7 @@ import structlog
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Procedure
 from room_config.load import Config
+from service.alarms import Condition
 from service.commands import Commands
 from service.describe import Describer
 from service.execution import Execution, ProcedureAbortedError
@@ -66,9 +67,16 @@ class _Asked:
 class ControlLoop:
     """Start it with `start`, ask it with `call`, end it with `close`."""
 
-    def __init__(self, config: Config, link: RoomLink) -> None:
+    def __init__(
+        self,
+        config: Config,
+        link: RoomLink,
+        others_wrong: Callable[[], Sequence[Condition]] = tuple,
+    ) -> None:
+        """others_wrong: what else is an alarm now; must answer at once."""
         self._config = config
         self._link = link
+        self._others_wrong = others_wrong
         self._link.client.while_moving = self._while_moving
         self._queue: queue.Queue[_Asked] = queue.Queue()
         self._published_change = (0, 0)
@@ -138,7 +146,7 @@ class ControlLoop:
         execution = Execution(self._config, record, self._link, self._tick)
         self._commands = Commands(Room(self._config, record, self._link, execution))
         self._record, self._execution = record, execution
-        self._describer = Describer(self._config, record, self._link)
+        self._describer = Describer(self._config, record, self._link, self._others_wrong)
         while not self._closing.is_set():
             self._tick()
             running = record.running_procedure()

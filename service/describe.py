@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
 from room_config.load import Config
-from service.alarms import AlarmBook
+from service.alarms import AlarmBook, Condition
 from service.conditions import conditions
 from service.describe_measurement import (
     describe_error,
@@ -43,7 +44,14 @@ _LOOK_EVERY_S = 0.25
 class Describer:
     """Makes the state anew when asked; keeps only what is dear to find out again."""
 
-    def __init__(self, config: Config, record: CaseRecord, link: RoomLink) -> None:
+    def __init__(
+        self,
+        config: Config,
+        record: CaseRecord,
+        link: RoomLink,
+        others_wrong: Callable[[], Sequence[Condition]] = tuple,
+    ) -> None:
+        self._others_wrong = others_wrong
         self._config = config
         self._record = record
         self._link = link
@@ -85,7 +93,7 @@ class Describer:
                 "processes": self._look_at_processes(),
             }
         )
-        alarms = self._alarms.update(conditions(state), record)
+        alarms = self._alarms.update([*conditions(state), *self._others_wrong()], record)
         state = state.model_copy(update={"alarms": alarms})
         same = state.model_copy(update={"at_s": before.at_s}) == before
         return state.model_copy(update={"revision": before.revision + (not same)})
