@@ -328,23 +328,26 @@ def test_h13_a_peer_with_another_schema_can_still_stop(shared_room: BridgeRoom):
     wait_for_health(room, lambda h: h["stopped"] and h["stop_reason"] == "operator_stop")
 
 
-def test_the_lock_set_in_motion_stops_it(shared_room: BridgeRoom):
-    room = shared_room
-    client = room.ready_client()
-    raw_outcome: list = []
-    done = threading.Event()
+def test_the_lock_set_in_motion_stops_it(tmp_path: Path):
+    with bridge_room(tmp_path, speed_hz=200) as room:  # about 15 s to get there
+        room.start_daemon()
+        client = room.ready_client()
+        locked = threading.Event()
 
-    def lock_when_moving(state, status) -> None:
-        if not done.is_set():
-            done.set()
-            time.sleep(0.1)
+        def lock_when_moving(state, status) -> None:
+            if locked.is_set():
+                return
+            locked.set()
+            while max(room.controllers.positions_um().values()) < 50:
+                client.pump(0.01)
             client.set_insertion_lock(True, "test")
 
-    raw_outcome.append(client.move(room.id("a"), FAR, None, lock_when_moving))
-    assert raw_outcome[0].code == "locked_in_motion"
-    assert max(room.controllers.positions_um().values()) < 13_000
-    client.arm("test")
-    assert client.move(room.id("b"), dict.fromkeys(AXES, 0), None).code == "insertion_locked"
+        outcome = client.move("a", FAR, None, lock_when_moving)
+        assert outcome.code == "locked_in_motion"
+        assert 50 <= max(room.controllers.positions_um().values()) < 13_000
+        assert client.status.insertion_locked
+        client.arm("test")
+        assert client.move("b", dict.fromkeys(AXES, 0), None).code == "insertion_locked"
 
 
 def test_a_stalled_axis_fails_the_move_and_latches(shared_room: BridgeRoom):
