@@ -138,6 +138,21 @@ def _um(value_mm: float, round_inwards: Any) -> int:
     return int(round_inwards(value_mm * 1000.0 + inwards))
 
 
+def _travel_mm(table: _Table) -> tuple[float, float]:
+    lo_mm = table.number("travel_min_mm", -TRAVEL_MAX_MM, TRAVEL_MAX_MM)
+    hi_mm = table.number("travel_max_mm", -TRAVEL_MAX_MM, TRAVEL_MAX_MM)
+    if not lo_mm < hi_mm:
+        raise table.fail("travel_max_mm", f"{hi_mm} is not above travel_min_mm {lo_mm}")
+    return lo_mm, hi_mm
+
+
+def _sign(table: _Table) -> int:
+    sign: int = table.integer("sign", -1, 1)
+    if sign == 0:
+        raise table.fail("sign", "must be 1 or -1")
+    return sign
+
+
 def _axis_from_table(raw: Any, where: str) -> AxisConfig:
     if not isinstance(raw, Mapping):
         raise ConfigError(f"{where}: is not a table")
@@ -147,13 +162,8 @@ def _axis_from_table(raw: Any, where: str) -> AxisConfig:
     table.text("name")
     drive = table.text("drive", among=DRIVES)
     closed = drive == "closed_loop"
-    lo_mm = table.number("travel_min_mm", -TRAVEL_MAX_MM, TRAVEL_MAX_MM)
-    hi_mm = table.number("travel_max_mm", -TRAVEL_MAX_MM, TRAVEL_MAX_MM)
-    if not lo_mm < hi_mm:
-        raise table.fail("travel_max_mm", f"{hi_mm} is not above travel_min_mm {lo_mm}")
-    sign = table.integer("sign", -1, 1)
-    if sign == 0:
-        raise table.fail("sign", "must be 1 or -1")
+    lo_mm, hi_mm = _travel_mm(table)
+    sign = _sign(table)
     home_mm = table.number("home_mm", lo_mm, hi_mm, default=None)
     axis = AxisConfig(
         name=name,
@@ -177,6 +187,14 @@ def _axis_from_table(raw: Any, where: str) -> AxisConfig:
     return axis
 
 
+def _heartbeat_and_deadman_s(keys: _Table) -> tuple[float, float]:
+    heartbeat_s = float(keys.number("heartbeat_s", 0.02, 1.0, default=0.2))
+    deadman_s = float(keys.number("deadman_s", 0.1, 5.0, default=1.0))
+    if not deadman_s >= 3 * heartbeat_s:
+        raise keys.fail("deadman_s", f"{deadman_s} is below three heartbeats of {heartbeat_s} s")
+    return heartbeat_s, deadman_s
+
+
 def bridge_config_from_table(table: Mapping[str, Any], where: str) -> BridgeConfig:
     """The checked `[bridge]` table; `where` names the file in errors. Raises ConfigError."""
     if not isinstance(table, Mapping):
@@ -184,10 +202,7 @@ def bridge_config_from_table(table: Mapping[str, Any], where: str) -> BridgeConf
     keys = _Table(table, f"{where}: bridge.")
     link = keys.text("link")
     state_dir = Path(keys.text("state_dir"))
-    heartbeat_s = float(keys.number("heartbeat_s", 0.02, 1.0, default=0.2))
-    deadman_s = float(keys.number("deadman_s", 0.1, 5.0, default=1.0))
-    if not deadman_s >= 3 * heartbeat_s:
-        raise keys.fail("deadman_s", f"{deadman_s} is below three heartbeats of {heartbeat_s} s")
+    heartbeat_s, deadman_s = _heartbeat_and_deadman_s(keys)
     status_file = keys.text("status_file", default=None)
     capture_file = keys.text("capture_file", default=None)
     raw_axes = keys.take("axis", ...)

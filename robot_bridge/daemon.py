@@ -15,7 +15,8 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from robot_bridge.bridge import Bridge, BridgeSettings
+from robot_bridge.bridge import Bridge
+from robot_bridge.bridge_settings import BridgeSettings
 from robot_bridge.config import BridgeConfig
 from robot_bridge.guardian import Guardian
 from robot_bridge.journal import Journal, JournalError

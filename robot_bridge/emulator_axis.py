@@ -5,15 +5,15 @@ Time is an argument: `advance(now_s)` brings the controller to an instant of a m
 timing of the protocol stays real. The motor model behind it is the caller's (StagePhysics).
 """
 
-import math
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from robot_bridge import emulator_settings as y
 from robot_bridge.emulator_physics import StagePhysics
+from robot_bridge.emulator_runs import OpenRun, PositionLog, TargetRun
 from robot_bridge.emulator_settings import EmulatedSettings, Model
 from robot_bridge.emulator_switches import AxisFaults, Switches
-from robot_bridge.pmd_protocol import MICROSTEPS_PER_STEP, SPEED_PARAMETER_PER_COUNT
+from robot_bridge.pmd_protocol import MICROSTEPS_PER_STEP
 from robot_bridge.pmd_status import Status
 
 UNPARK_S, PARK_S, REBOOT_S = 0.08, 0.25, 2.5
@@ -40,40 +40,6 @@ class Motor:
     def max_frequency_hz(self) -> int:
         derated = DERATING_NF_HZ[self.model] // self.capacitance_nf
         return min(MAX_SPEED_HZ[self.model], derated)
-
-
-@dataclass
-class OpenRun:
-    """A run of microsteps without regard to the encoder."""
-
-    remaining: int  # microsteps, unsigned
-    direction: int
-    frequency_hz: float
-    until_index: bool = False
-    script: bool = False
-    due: float = 0.0  # microsteps, fraction carried between ticks
-
-
-@dataclass
-class TargetRun:
-    """The position loop; it stays on after arrival until something ends it."""
-
-    target_count: int
-    start_count: int
-    speed_hz: float
-    frequency_hz: float = 0.0
-    timer_s: float = 0.0
-    reached: bool = False
-    idle: bool = False  # stands inside the stop range, or at a target limit
-    due: float = 0.0
-
-
-@dataclass
-class PositionLog:
-    period_s: float
-    started_at_ms: int
-    positions: list[int] = field(default_factory=list)
-    waited_s: float = 0.0
 
 
 class EmulatedController:
@@ -240,7 +206,7 @@ class EmulatedController:
 
     def _tick(self, tick_s: float) -> None:
         if self.log is not None:
-            self._log_tick(self.log, tick_s)
+            self.log.tick(tick_s, self.count)
         if not self.can_run or self.faults.dead:
             return
         if isinstance(self.run, OpenRun):
@@ -249,11 +215,8 @@ class EmulatedController:
             self._target_tick(self.run, tick_s)
 
     def _open_tick(self, run: OpenRun, tick_s: float) -> None:
-        run.due += self.clamp_speed(run.frequency_hz) * MICROSTEPS_PER_STEP * tick_s
-        microsteps = min(int(run.due), run.remaining)
-        run.due -= microsteps
-        run.remaining -= microsteps
-        self._drive(run.direction * microsteps, run.frequency_hz)
+        microsteps = run.advance(self.clamp_speed(run.frequency_hz), tick_s)
+        self._drive(microsteps, run.frequency_hz)
         if run.remaining == 0 and self.run is run:
             self.run = None
             if run.script:
@@ -264,42 +227,16 @@ class EmulatedController:
             run.timer_s += tick_s
         error = run.target_count - self.count
         if abs(error) <= self.settings[y.STOP_RANGE]:
-            run.reached = run.idle = True
-            run.frequency_hz = run.due = 0.0
+            run.arrive()
             return
-        if self._beyond_limit(run, error):
+        if run.beyond_limit(self.count, self.settings):
             self.target_limit = run.idle = True
             return
         run.idle = False
-        self._regulate(run, error, tick_s)
-
-    def _beyond_limit(self, run: TargetRun, error: int) -> bool:
-        """Beyond a target limit, and not on the way back from there."""
-        outwards = self.count - run.start_count
-        if self.count >= self.settings[y.LIMIT_B]:
-            return error > 0 or outwards > 0
-        return self.count <= self.settings[y.LIMIT_A] and (error < 0 or outwards < 0)
-
-    def _regulate(self, run: TargetRun, error: int, tick_s: float) -> None:
-        gain = self.settings[y.STEPS_PER_COUNT] / SPEED_PARAMETER_PER_COUNT  # microsteps a count
-        remaining = abs(error) * gain
-        wanted_hz = self._ramped_hz(run, remaining / MICROSTEPS_PER_STEP, tick_s)
-        run.frequency_hz = wanted_hz
-        run.due += min(wanted_hz * MICROSTEPS_PER_STEP * tick_s, remaining)
-        microsteps = int(run.due)
-        run.due -= microsteps
-        direction = 1 if error > 0 else -1
-        self.reverse = direction < 0
-        self._drive(direction * microsteps, wanted_hz)
-
-    def _ramped_hz(self, run: TargetRun, remaining_steps: float, tick_s: float) -> float:
-        up_hz_s = self.settings[y.RAMP_UP] * 1000.0
-        down_hz_s = self.settings[y.RAMP_DOWN] * 1000.0
-        ceiling = self.clamp_speed(run.speed_hz)
-        ramped = run.frequency_hz + up_hz_s * tick_s if up_hz_s else ceiling
-        braked = math.sqrt(2 * down_hz_s * remaining_steps) if down_hz_s else ceiling
-        floor = min(max(1, self.settings[y.MIN_SPEED]), ceiling)
-        return max(floor, min(ceiling, ramped, braked))
+        self.reverse = error < 0
+        ceiling_hz = self.clamp_speed(run.speed_hz)
+        microsteps = run.regulate(error, self.settings, ceiling_hz, tick_s)
+        self._drive(microsteps, run.frequency_hz)
 
     def _script_turn(self, run: OpenRun) -> None:
         """The auto-setup script: forward, then back, then direction and gain from the counts."""
@@ -354,12 +291,6 @@ class EmulatedController:
         if self.index_mode == 4:
             self.count = self.settings[y.INDEX_OFFSET]
         self.index_mode = 1
-
-    def _log_tick(self, log: PositionLog, tick_s: float) -> None:
-        log.waited_s += tick_s
-        if log.waited_s + 1e-9 >= log.period_s and len(log.positions) < 100:
-            log.waited_s = 0.0
-            log.positions.append(self.count)
 
     # Status
 

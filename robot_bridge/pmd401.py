@@ -14,17 +14,17 @@ from pathlib import Path
 from robot_bridge.config import AxisConfig
 from robot_bridge.motors import MotorError, MotorStatus
 from robot_bridge.pmd_axis import PmdAxis
-from robot_bridge.pmd_controller import POWER_ON_DELAY_US, AxisFaultError
+from robot_bridge.pmd_checks import check_run, check_setpoint, code_and_text
+from robot_bridge.pmd_controller import POWER_ON_DELAY_US
 from robot_bridge.pmd_line import PmdLine, Procedure, Task
 from robot_bridge.pmd_ports import OpenPort, PmdPorts, SerialPort
-from robot_bridge.pmd_protocol import PmdEchoError, PmdError, PmdTimeoutError
+from robot_bridge.pmd_protocol import PmdEchoError, PmdError
+from robot_bridge.pmd_stop import confirm_stops
 
 log = logging.getLogger(__name__)
 
 UNTRIED = "PMD401/PMD301 driver: not tried on hardware; do the first-unit checks of bring_up.md"
 POLL_BUDGET_S = 0.02
-STOP_DEADLINE_S = 0.25
-STOP_ANSWER_TIMEOUT_S = 0.04
 INITIALISE_DEADLINE_S = 10.0
 DECLARE_DEADLINE_S = 2.0
 RECONNECT_PAUSE_S = 1.0
@@ -103,7 +103,7 @@ class PmdMotors:
         self._require_ready()
         axes = {name: self._axis(name) for name in setpoints_um}
         for name, axis in axes.items():
-            _check_setpoint(axis.config, setpoints_um[name])
+            check_setpoint(axis.config, setpoints_um[name])
         for axis in self._axes.values():
             if axis.fault is not None:
                 raise MotorError(*axis.fault)
@@ -130,7 +130,7 @@ class PmdMotors:
         """
         self._require_ready()
         axis = self._axis(name)
-        _check_run(axis, steps)
+        check_run(axis, steps)
         self._begin({})
         self._start(name, axis.run_steps(steps), "run")
 
@@ -230,7 +230,7 @@ class PmdMotors:
         return failed
 
     def _note_error(self, axis: PmdAxis, error: PmdError) -> tuple[str, str]:
-        failed = _code_and_text(axis, error)
+        failed = code_and_text(axis, error)
         if failed != axis.fault:
             log.warning("%s", failed[1])
         axis.fault = failed
@@ -321,45 +321,16 @@ class PmdMotors:
         if self._reconnect_s is None:
             self._fault = None
         failures += self._ports.send_stop()
-        failures += self._confirm_stops()
+        failures += confirm_stops(
+            list(self._axes.values()),
+            self._ports.lines,
+            self._clock,
+            timeout_s=self._timeout_s,
+        )
         if self._reconnect_s is not None:
             self._ports.close()  # initialised again from the start, by `poll`
         if failures:
             raise MotorError("stop_unconfirmed", "; ".join(failures))
-
-    def _confirm_stops(self) -> list[str]:
-        deadline_s = self._clock() + STOP_DEADLINE_S
-        lines = list(self._ports.lines.values())
-        for line in lines:
-            line.timeout_s = min(self._timeout_s, STOP_ANSWER_TIMEOUT_S)
-        tasks = {
-            name: self._line_of(axis).start(_stop_stubbornly(axis), f"stop of {name}")
-            for name, axis in self._axes.items()
-            if axis.config.controller in self._ports.lines
-        }
-        failures: set[str] = set()
-        while not all(t.done for t in tasks.values()) and self._clock() < deadline_s:
-            for line in lines:
-                try:
-                    line.step(0.01)
-                except OSError as error:
-                    line.cancel_all()
-                    failures.add(f"controller port: {error}")
-        unconfirmed = [name for name, task in tasks.items() if not task.done or task.error]
-        for line in lines:
-            line.cancel_all()
-            line.timeout_s = self._timeout_s
-        return [*failures, *(f"axis {name} did not confirm the stop" for name in unconfirmed)]
-
-
-def _stop_stubbornly(axis: PmdAxis) -> Procedure:
-    """Lost and damaged answers do not end it; the caller's deadline does."""
-    while True:
-        try:
-            yield from axis.confirm_stop()
-        except PmdError:
-            continue
-        return
 
 
 def _addresses_by_url(axes: Sequence[AxisConfig]) -> dict[str, list[int]]:
@@ -367,45 +338,3 @@ def _addresses_by_url(axes: Sequence[AxisConfig]) -> dict[str, list[int]]:
     for axis in axes:
         by_url.setdefault(axis.controller, []).append(axis.address)
     return by_url
-
-
-def _check_setpoint(axis: AxisConfig, setpoint_um: int) -> None:
-    if not isinstance(setpoint_um, int) or (
-        not axis.travel_min_um <= setpoint_um <= axis.travel_max_um
-    ):
-        raise MotorError(
-            "beyond_travel",
-            f"axis {axis.name}: setpoint {setpoint_um!r} um is outside "
-            f"{axis.travel_min_um}..{axis.travel_max_um} um",
-        )
-
-
-def _check_run(axis: PmdAxis, steps: int) -> None:
-    """An open-loop axis whose position nobody declared has none to check: the engineer looks."""
-    config = axis.config
-    if not isinstance(steps, int) or steps == 0:
-        raise MotorError("bad_run", f"axis {config.name}: a run of {steps!r} steps")
-    if not (axis.closed_loop or axis.certain):
-        return
-    reach_um = 2 * abs(steps) * max(config.step_um_forward, config.step_um_reverse)
-    direction = config.sign * (1 if steps > 0 else -1)
-    end_um = axis.readback_um() + direction * reach_um
-    if not config.travel_min_um <= end_um <= config.travel_max_um:
-        raise MotorError(
-            "beyond_travel",
-            f"axis {config.name}: {steps:+d} steps could reach {end_um:.0f} um, outside "
-            f"{config.travel_min_um}..{config.travel_max_um} um",
-        )
-
-
-_CODES: dict[type[PmdError], str] = {
-    PmdTimeoutError: "no_answer",
-    PmdEchoError: "damaged_command",
-}
-
-
-def _code_and_text(axis: PmdAxis, error: PmdError) -> tuple[str, str]:
-    if isinstance(error, AxisFaultError):
-        return error.code, str(error)
-    code = next((c for kind, c in _CODES.items() if isinstance(error, kind)), "protocol")
-    return code, f"axis {axis.config.name}: {error}"

@@ -30,15 +30,20 @@ from service.gate import Gate
 from service.igtl_server import OpenIgtLinkServer
 from service.live import Broadcast
 from service.metrics import RoomMetrics
+from service.orders import Orders
 from service.outbox_watch import OutboxWatch
 from service.problems import Problem, add_problems, problem, responses
 from service.room_link import PumpedClient, RoomLink
 from service.routes_access import access_router
-from service.routes_command import clerk_router, command_router, stop_router
+from service.routes_clerk import clerk_router
 from service.routes_documents import document_router
 from service.routes_images import measurement_image_router, slice_image_router
+from service.routes_live import live_router
 from service.routes_outputs import outbox_router, output_router
-from service.routes_record import live_router, record_router
+from service.routes_procedure import procedure_router
+from service.routes_record import event_router, measurement_router, slice_router
+from service.routes_robot import robot_router, stop_router
+from service.routes_target import target_router
 
 PAGE = Path(__file__).parent / "page"
 _HOUR_S = 3600.0
@@ -91,18 +96,22 @@ def create_app(
     access = Access(access_rules(config))
     app.add_middleware(Gate, access=access, uses_tls=uses_tls)
     add_problems(app)
-    case_dir = config.room.case_dir
+    case_dir, orders = config.room.case_dir, Orders(loop)
     for router in (
         stop_router(loop),
         live_router(loop, broadcast),
-        record_router(case_dir),
+        event_router(case_dir),
+        slice_router(case_dir),
+        measurement_router(case_dir),
         slice_image_router(case_dir),
         measurement_image_router(case_dir),
         output_router(case_dir),
         outbox_router(config),
         document_router(case_dir),
-        command_router(loop),
-        clerk_router(loop),
+        robot_router(orders),
+        target_router(orders),
+        procedure_router(orders),
+        clerk_router(orders),
         access_router(access, uses_tls=uses_tls),
     ):
         app.include_router(router)

@@ -19,6 +19,7 @@ from service.plane import ImagePlane
 from service.sensing import (
     Expectation,
     ProcedureFailedError,
+    ValidationGate,
     check_prediction,
     estimate_from,
     measure_here,
@@ -36,15 +37,8 @@ class CalibrationArguments:
     origin_um: Mapping[str, int]
     move_um: int
     shifts_px: tuple[tuple[float, float], ...]
-    position_gate_mm: float
-    gate_sigma: float
-    repeatability_mm: float
-    scale_error: float
+    gate: ValidationGate
     method: str = "ml"
-
-    @property
-    def noise(self) -> MotionNoise:
-        return MotionNoise(self.repeatability_mm, self.scale_error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -121,8 +115,7 @@ def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
     found = yield from drive_and_learn(
         _places(arguments),
         ImageJacobian.unknown(arguments.axes),
-        arguments.noise,
-        _ASYMMETRY_CHECK_SIGMA,
+        replace(arguments.gate, gate_sigma=_ASYMMETRY_CHECK_SIGMA),
         look,
         _check,
     )
@@ -132,15 +125,14 @@ def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
 def drive_and_learn(
     places: Sequence[Mapping[str, int]],
     jacobian: ImageJacobian,
-    noise: MotionNoise,
-    gate_sigma: float,
+    gate: ValidationGate,
     look: LookThere[SeenThere],
     check: Callable[[ImageJacobian], None],
 ) -> ProcedureSteps[Calibration]:
     """Drive to each place, look, and learn from each move; the last one is predicted.
 
     The last place is the way back: `check` must be content before it is driven, and what is seen
-    there must be what was predicted (within `gate_sigma`).
+    there must be what was predicted.
     """
     before: FiducialEstimate | None = None
     plane: ImagePlane | None = None
@@ -153,14 +145,14 @@ def drive_and_learn(
         )
         predicted = None
         if last and before is not None:
-            predicted = before.moved_to(moved.readback_um, jacobian, noise)
+            predicted = before.moved_to(moved.readback_um, jacobian, gate.noise)
         seen = yield from look(before, predicted)
         plane = _checked_plane(plane, seen.plane)
         here = seen.at(moved.readback_um)
         if predicted is not None:
-            check_prediction(predicted, here, gate_sigma, noise)
+            check_prediction(predicted, here, gate)
         if before is not None:
-            jacobian = learn_from_move(jacobian, before, here, noise)
+            jacobian = learn_from_move(jacobian, before, here, gate.noise)
         before = here
     assert before is not None
     assert plane is not None
@@ -207,7 +199,7 @@ def _expectation(
     if before is None:
         return None
     if predicted is not None:
-        return Expectation.of(predicted, arguments.position_gate_mm, arguments.gate_sigma)
+        return arguments.gate.around(predicted)
     # which way the axis points in the image is not known yet: anywhere around the last place
     return Expectation(before.plane_mm, abs(arguments.move_um) / 1000 * 1.3)
 
@@ -224,7 +216,7 @@ def _refine(found: Calibration, arguments: CalibrationArguments) -> ProcedureSte
     """Measure once more with the commanded shifts around the origin, if any are wanted."""
     if len(arguments.shifts_px) < 2:
         return found
-    expectation = Expectation.of(found.estimate, arguments.position_gate_mm, arguments.gate_sigma)
+    expectation = arguments.gate.around(found.estimate)
     shifted = yield from measure_shift_set(
         found.estimate,
         arguments.shifts_px,
@@ -232,7 +224,7 @@ def _refine(found: Calibration, arguments: CalibrationArguments) -> ProcedureSte
         found.plane,
         arguments.method,
         expectation,
-        arguments.noise,
+        arguments.gate.noise,
     )
     # all that was known before has been through the same moves: nothing to add
     return replace(found, estimate=shifted.estimate, measurement_id=shifted.measured.measurement_id)

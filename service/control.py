@@ -28,6 +28,7 @@ from service.guide_recording import GuidePlace
 from service.procedures import build_procedure, result_to_json
 from service.readiness import ConflictError
 from service.recording import Place
+from service.room import Room
 from service.room_link import RoomLink
 from service.runner import ReplayMismatchError, run_procedure
 from service.sensing import ProcedureFailedError
@@ -143,7 +144,7 @@ class ControlLoop:
     def _serve(self, record: CaseRecord) -> None:
         case = record.start_case(self._config.room.name, seed=0)
         execution = Execution(self._config, record, self._link, self._tick)
-        self._commands = Commands(self._config, record, self._link, execution)
+        self._commands = Commands(Room(self._config, record, self._link, execution))
         self._record, self._execution = record, execution
         self._describer = Describer(self._config, record, self._link, self._others_wrong)
         while not self._closing.is_set():
@@ -249,7 +250,7 @@ def _answer(commands: Commands, asked: _Asked, moving: bool, publish: Callable[[
     try:
         if moving and asked.name not in _WHILE_MOVING:
             raise ConflictError("moving", "The robot moves: wait until it stands, or press STOP.")
-        result = getattr(commands, asked.name)(**asked.arguments)
+        result = commands.carry_out(asked.name, asked.arguments)
         log.info("command", command=asked.name, by=asked.arguments.get("by"))
         publish()
         asked.future.set_result(result)

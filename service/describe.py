@@ -3,21 +3,23 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any
-
-import numpy as np
 
 from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
-from robot_bridge.client import BridgeStatus
-from robot_bridge.phases import WorkPhase
 from room_config.load import Config
 from service.alarms import AlarmBook, Condition
-from service.estimate import probability_within
+from service.conditions import conditions
+from service.describe_measurement import (
+    describe_error,
+    describe_measurement,
+    describe_other_fiducial,
+    describe_reconstruction,
+)
 from service.execution import Execution
-from service.procedures import CALIBRATION, GUIDE_CALIBRATION, latest_calibration
+from service.prompt import is_calibrated, outcome_text, prompt
 from service.readiness import may_start, ready_arrival
 from service.room_link import RoomLink
 from service.state import (
@@ -25,25 +27,18 @@ from service.state import (
     ArrivalState,
     CaseState,
     ClockState,
-    ErrorState,
-    FiducialState,
     HoldState,
-    MeasurementState,
     ProcessState,
     QuestionState,
-    ReconstructionState,
     RobotState,
     RoomState,
     SliceState,
 )
 from service.targets import current_entry, current_target
-from sr_engine.geometry import SliceGeometry
 
 PROCESSES = ("listener", "worker")
 _BEAT_IS_OLD_S = 3.0
 _LOOK_EVERY_S = 0.25
-_LOOKED_BACK = 24
-_SAME_SLICE_MM = 0.5
 
 
 class Describer:
@@ -69,58 +64,36 @@ class Describer:
         """Return the present state; the revision grows only if something else than time changed."""
         config, record, link = self._config, self._record, self._link
         case = record.case()
-        running = record.running_procedure()
-        ended = record.last_ended_procedure()
-        last = record.last_slice()
-        shown = record.last_slice("assigned") or last
         target = current_target(record)
         target_mm = list(target.patient_mm) if target else None
-        arrival = ready_arrival(record)
         measurement = record.last_measurement()
-        robot = _robot(link, before.robot)
-        slices = record.count_slices()
-        processes = self._look_at_processes()
+        arrival = _arrival(record)
         state = before.model_copy(
             update={
                 "at_s": time.time(),
                 "case_uid": case.case_uid if case else "",
                 "case": _case(record),
-                "procedure": running.name if running else None,
-                "procedure_id": running.procedure_id if running else None,
-                "last_outcome": ""
-                if ended is None
-                else _outcome_text(ended.name, ended.state, ended.result),
-                "prompt": _prompt(config, record, link, execution, arrival is not None),
+                **_procedures(record, execution),
+                "prompt": prompt(config, record, link, execution, arrival is not None),
                 "ready": arrival is not None,
-                "arrival": None if arrival is None else _arrival(*arrival),
-                "punctured": arrival is not None and _punctured(record, arrival[0]),
-                "robot": robot,
+                "arrival": arrival,
+                "punctured": arrival is not None and _punctured(record, arrival.procedure_id),
+                "robot": _robot(link, before.robot),
                 "jog_possible": may_start(record, link.status) is None,
-                "acquisition_request": None
-                if execution.request is None
-                else AcquisitionState(**vars(execution.request)),
-                "question": None
-                if execution.question is None
-                else QuestionState(
-                    **{**vars(execution.question), "choices": list(execution.question.choices)}
-                ),
                 "hold": _hold(record),
-                "last_slice_id": last.slice_id if last else None,
-                "last_slice_received_s": last.received_s if last else None,
-                "slices": slices,
-                "slice": None if shown is None else _slice(shown),
-                "measurement": None if measurement is None else _measurement(measurement),
+                **_slices(record),
+                "measurement": None if measurement is None else describe_measurement(measurement),
                 **self._around(measurement, before),
                 "clock": _clock(config, record),
-                "calibrated": _is_calibrated(config, record),
+                "calibrated": is_calibrated(config, record),
                 "target_patient_mm": tuple(target_mm) if target_mm else None,
                 "entry_patient_mm": current_entry(record),
-                "error": _error(config, record, target_mm),
+                "error": describe_error(config, record, target_mm),
                 "event_id": record.last_event_id(),
-                "processes": processes,
+                "processes": self._look_at_processes(),
             }
         )
-        alarms = self._alarms.update([*_conditions(state), *self._others_wrong()], record)
+        alarms = self._alarms.update([*conditions(state), *self._others_wrong()], record)
         state = state.model_copy(update={"alarms": alarms})
         same = state.model_copy(update={"at_s": before.at_s}) == before
         return state.model_copy(update={"revision": before.revision + (not same)})
@@ -131,8 +104,8 @@ class Describer:
             return {}
         self._around_id = last.measurement_id
         return {
-            "reconstruction": _reconstruction(self._record, before.reconstruction, last),
-            "other_fiducial": _other_fiducial(self._record, last),
+            "reconstruction": describe_reconstruction(self._record, before.reconstruction, last),
+            "other_fiducial": describe_other_fiducial(self._record, last),
         }
 
     def _look_at_processes(self) -> list[ProcessState]:
@@ -176,10 +149,19 @@ def _robot(link: RoomLink, before: RobotState) -> RobotState:
     )
 
 
-def _is_calibrated(config: Config, record: CaseRecord) -> bool:
-    """As the room is used: with the guide's four axes if it has them."""
-    name = CALIBRATION if config.service.guide is None else GUIDE_CALIBRATION
-    return record.last_procedure(name, "done") is not None
+def _procedures(record: CaseRecord, execution: Execution) -> dict[str, Any]:
+    """The one that runs, what it asks for, and how the last one ended."""
+    running, ended = record.running_procedure(), record.last_ended_procedure()
+    request, question = execution.request, execution.question
+    return {
+        "procedure": running.name if running else None,
+        "procedure_id": running.procedure_id if running else None,
+        "last_outcome": outcome_text(ended.name, ended.state, ended.result) if ended else "",
+        "acquisition_request": AcquisitionState(**vars(request)) if request else None,
+        "question": QuestionState(**{**vars(question), "choices": list(question.choices)})
+        if question
+        else None,
+    }
 
 
 def _case(record: CaseRecord) -> CaseState | None:
@@ -192,6 +174,18 @@ def _hold(record: CaseRecord) -> HoldState | None:
     if hold is None:
         return None
     return HoldState(hold_id=hold.hold_id, set_id=hold.set_id, settled_at_s=hold.settled_at_s)
+
+
+def _slices(record: CaseRecord) -> dict[str, Any]:
+    """How many there are, the last one, and the one that is shown."""
+    last = record.last_slice()
+    shown = record.last_slice("assigned") or last
+    return {
+        "last_slice_id": last.slice_id if last else None,
+        "last_slice_received_s": last.received_s if last else None,
+        "slices": record.count_slices(),
+        "slice": _slice(shown) if shown else None,
+    }
 
 
 def _slice(row: SliceRow) -> SliceState | None:
@@ -208,7 +202,12 @@ def _slice(row: SliceRow) -> SliceState | None:
     )
 
 
-def _arrival(procedure_id: int, result: dict[str, Any]) -> ArrivalState:
+def _arrival(record: CaseRecord) -> ArrivalState | None:
+    """Of the approach whose target the needle guide is at."""
+    arrival = ready_arrival(record)
+    if arrival is None:
+        return None
+    procedure_id, result = arrival
     known = {name: result[name] for name in ArrivalState.model_fields if name in result}
     return ArrivalState(procedure_id=procedure_id, **known)
 
@@ -235,178 +234,3 @@ def _clock(config: Config, record: CaseRecord) -> ClockState | None:
     if listener.clock_offset_s is None:
         return None
     return ClockState(offset_s=listener.clock_offset_s, uncertainty_s=listener.clock_uncertainty_s)
-
-
-def _other_fiducial(record: CaseRecord, last: Measurement) -> FiducialState | None:
-    """The newest one found at another slice position than the newest measurement's."""
-    at_mm = last.request.get("slice_position_mm")
-    if at_mm is None:
-        return None
-    before = record.page_of_measurements(
-        after_id=last.measurement_id, limit=_LOOKED_BACK, newest=True
-    )
-    for row in before:
-        other_mm = row.request.get("slice_position_mm")
-        if row.result and other_mm is not None and abs(other_mm - at_mm) > _SAME_SLICE_MM:
-            return FiducialState(
-                measurement_id=row.measurement_id,
-                patient_mm=row.result["patient_mm"],
-                radius_mm=_radius_mm(row.result),
-            )
-    return None
-
-
-def _measurement(last: Measurement) -> MeasurementState:
-    found = last.result or {}
-    return MeasurementState(
-        measurement_id=last.measurement_id,
-        method=last.method,
-        state=last.state,
-        finished_s=last.finished_s,
-        reason=last.reason,
-        slice_id=found.get("slice_id"),
-        centre_px=found.get("centre_px"),
-        sigma_px=found.get("sigma_px"),
-        radius_px=found.get("radius_px"),
-        radius_mm=_radius_mm(found) if found else None,
-        covariance_mm2=found.get("covariance_mm2"),
-        patient_mm=found.get("patient_mm"),
-        n_frames=found.get("n_frames", 0),
-        snr=found.get("snr"),
-        has_reconstruction=bool(found.get("reconstruction")),
-    )
-
-
-def _reconstruction(
-    record: CaseRecord, before: ReconstructionState | None, last: Measurement
-) -> ReconstructionState | None:
-    """The newest measurement's, if it has one; else the one that was shown, or at a new start of
-    the service the newest of the last ones.
-    """
-    rows = [last]
-    if before is None:
-        rows += record.page_of_measurements(
-            after_id=last.measurement_id, limit=_LOOKED_BACK, newest=True
-        )
-    newest = next(filter(_has_reconstruction, rows), None)
-    return before if newest is None else reconstruction_state(record, newest)
-
-
-def _has_reconstruction(measurement: Measurement) -> bool:
-    return bool((measurement.result or {}).get("reconstruction"))
-
-
-def reconstruction_state(record: CaseRecord, measurement: Measurement) -> ReconstructionState:
-    """Geometry of a measurement's super-resolution image; it covers what its slices cover."""
-    result = measurement.result or {}
-    row = record.slice(result["slice_id"])
-    shape = np.load(record.case_dir / result["reconstruction"], mmap_mode="r").shape
-    geometry = _geometry(row)
-    factor = int(shape[0]) // geometry.shape[0]
-    fine = geometry.finer_grid(factor)
-    return ReconstructionState(
-        measurement_id=measurement.measurement_id,
-        factor=factor,
-        patient_mm=result["patient_mm"],
-        radius_mm=_radius_mm(result),
-        **vars(fine),
-    )
-
-
-def _radius_mm(result: Mapping[str, Any]) -> float:
-    return float(result["radius_px"]) * float(np.mean(result["plane"]["spacing_mm"]))
-
-
-def _geometry(row: SliceRow) -> SliceGeometry:
-    return SliceGeometry(**{k: tuple(v) for k, v in row.header["geometry"].items()})
-
-
-def _error(config: Config, record: CaseRecord, target_mm: list[float] | None) -> ErrorState | None:
-    """The error by the newest measurement alone (the procedure also knows the moves before)."""
-    last = record.last_measurement(state="done")
-    calibration = latest_calibration(record)
-    if last is None or last.result is None or target_mm is None or calibration is None:
-        return None
-    offset = calibration.plane.from_patient(target_mm) - np.array(last.result["plane_mm"])
-    covariance = np.array(last.result["covariance_mm2"])
-    spacing = np.array(calibration.plane.spacing_mm)
-    target_px = np.array(last.result["centre_px"]) + offset / spacing
-    return ErrorState(
-        row_mm=float(offset[0]),
-        col_mm=float(offset[1]),
-        error_mm=float(np.linalg.norm(offset)),
-        sigma_mm=float(np.sqrt(np.trace(covariance) / 2)),
-        probability_within_tolerance=probability_within(
-            offset, covariance, config.service.tolerance_mm
-        ),
-        target_px=(float(target_px[0]), float(target_px[1])),
-    )
-
-
-def _prompt(
-    config: Config, record: CaseRecord, link: RoomLink, execution: Execution, ready: bool
-) -> str:
-    if link.status is None:
-        return f"No link to the robot: {link.problem}"
-    return execution.prompt or _idle_prompt(config, record, link.status, ready)
-
-
-def _idle_prompt(config: Config, record: CaseRecord, status: BridgeStatus, ready: bool) -> str:
-    if ready:
-        return "READY: puncture; then say when the needle is out."
-    if status.phase is WorkPhase.EMERGENCY:
-        return "EMERGENCY: the drives are parked. See to patient and needle; then re-arm."
-    if status.stopped:
-        return f"Stopped ({_plain(status.stop_reason)}). Re-arm to go on."
-    if not status.armed:
-        return "Arm the robot."
-    if not _is_calibrated(config, record):
-        return "Start the calibration."
-    if current_target(record) is None:
-        return "Set a target."
-    if config.service.guide is not None and current_entry(record) is None:
-        return "Set an entry point."
-    return "Start the approach, or set another target."
-
-
-def _plain(code: str) -> str:
-    return code.replace("_", " ")
-
-
-def _outcome_text(name: str, state: str, result: Any) -> str:
-    reason = (result or {}).get("reason", "")
-    return f"{name} {state}" + (f": {reason}" if reason else "")
-
-
-def _conditions(state: RoomState) -> list[Condition]:
-    """What is wrong now, most urgent first; each with what to do about it."""
-    robot = state.robot
-    found = []
-    if not robot.linked:
-        found.append(
-            Condition(
-                "no_link", "alarm", f"No link to the robot: {robot.problem}", "Check the line."
-            )
-        )
-    if robot.linked and robot.fault:
-        found.append(Condition("fault", "alarm", f"Motor fault: {robot.fault}", "See the motors."))
-    if robot.linked and robot.phase == WorkPhase.EMERGENCY:
-        text = f"EMERGENCY ({_plain(robot.stop_reason)}): the drives are parked"
-        what = "See to patient and needle. Re-arm when it is safe, then measure again."
-        found.append(Condition("emergency", "alarm", text, what))
-    elif robot.linked and robot.stopped:
-        text = f"The robot is stopped ({_plain(robot.stop_reason)})"
-        found.append(Condition("stopped", "alarm", text, "Re-arm when it is safe."))
-    if robot.linked and not robot.position_certain:
-        text = "The robot's position is not certain"
-        found.append(Condition("position", "warning", text, "Re-arm, then measure."))
-    for process in state.processes:
-        if process.condition in ("down", "old"):
-            text = f"The {process.name} {process.detail}"
-            found.append(
-                Condition(f"{process.name}_lost", "alarm", text, f"Start the {process.name} again.")
-            )
-    if state.measurement is not None and state.measurement.state == "failed":
-        text = f"Measurement failed: {state.measurement.reason}"
-        found.append(Condition("measurement", "warning", text, "Rescan."))
-    return found

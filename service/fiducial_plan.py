@@ -12,11 +12,22 @@ from service.approach import ApproachArguments
 from service.calibration import Calibration, CalibrationArguments
 from service.plan import Travel, check_travel
 from service.recording import RecordingArguments
+from service.sensing import ValidationGate
 from service.targets import Target, fiducial_must_appear_at
 from sr_engine.shiftset import named, paper_random
 
 # a recorded target is to be known this much better than it must be reached
 TARGET_SHARE = 5
+
+
+def gate_of(config: Config) -> ValidationGate:
+    """Which measurements the room believes."""
+    return ValidationGate(
+        position_gate_mm=config.imaging.position_gate_mm,
+        gate_sigma=config.service.prediction_gate_sigma,
+        repeatability_mm=config.service.repeatability_um / 1000,
+        scale_error=config.service.step_scale_error,
+    )
 
 
 def calibration_of(config: Config, travel: Mapping[str, Travel], seed: int) -> CalibrationArguments:
@@ -31,10 +42,7 @@ def calibration_of(config: Config, travel: Mapping[str, Travel], seed: int) -> C
         origin_um=origin_um,
         move_um=move_um,
         shifts_px=_shifts_px(service.shift_set, seed),
-        position_gate_mm=config.imaging.position_gate_mm,
-        gate_sigma=service.prediction_gate_sigma,
-        repeatability_mm=service.repeatability_um / 1000,
-        scale_error=service.step_scale_error,
+        gate=gate_of(config),
     )
 
 
@@ -57,10 +65,7 @@ def approach_of(
         confidence=service.confidence,
         max_iterations=service.max_iterations,
         confirm_moves=service.confirm_moves,
-        position_gate_mm=config.imaging.position_gate_mm,
-        gate_sigma=service.prediction_gate_sigma,
-        repeatability_mm=service.repeatability_um / 1000,
-        scale_error=service.step_scale_error,
+        gate=gate_of(config),
         strategy=service.strategy,
         seed=seed,
     )
@@ -72,10 +77,7 @@ def recording_of(config: Config, seed: int) -> RecordingArguments:
     return RecordingArguments(
         strategy=service.strategy,
         sigma_mm=service.tolerance_mm / TARGET_SHARE,
-        position_gate_mm=config.imaging.position_gate_mm,
-        gate_sigma=service.prediction_gate_sigma,
-        repeatability_mm=service.repeatability_um / 1000,
-        scale_error=service.step_scale_error,
+        gate=gate_of(config),
         seed=seed,
     )
 

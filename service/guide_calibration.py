@@ -8,11 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from service.calibration import Calibration, drive_and_learn
-from service.estimate import FiducialEstimate, MotionNoise
+from service.estimate import FiducialEstimate
 from service.guide_geometry import GuideGeometry
 from service.guide_looking import BothSeen, gates, see_both
 from service.jacobian import ImageJacobian
-from service.sensing import Expectation, ProcedureFailedError
+from service.sensing import Expectation, ProcedureFailedError, ValidationGate
 from service.steps import ProcedureSteps
 
 _FIRST_GATE = 1.4
@@ -27,14 +27,7 @@ class GuideCalibrationArguments:
     origin_um: Mapping[str, int]
     move_um: int
     geometry: GuideGeometry
-    position_gate_mm: float
-    gate_sigma: float
-    repeatability_mm: float
-    scale_error: float
-
-    @property
-    def noise(self) -> MotionNoise:
-        return MotionNoise(self.repeatability_mm, self.scale_error)
+    gate: ValidationGate
 
 
 def calibrate_guide(arguments: GuideCalibrationArguments) -> ProcedureSteps[Calibration]:
@@ -50,8 +43,7 @@ def calibrate_guide(arguments: GuideCalibrationArguments) -> ProcedureSteps[Cali
         yield from drive_and_learn(
             _places(arguments),
             ImageJacobian.unknown(arguments.axes),
-            arguments.noise,
-            arguments.gate_sigma,
+            arguments.gate,
             look,
             lambda jacobian: _check_shares(jacobian, arguments.geometry),
         )
@@ -73,10 +65,11 @@ def _expectations(
     if before is None:
         return None, None
     if predicted is not None:
-        return gates(predicted, arguments.position_gate_mm, arguments.gate_sigma)
+        return gates(predicted, arguments.gate)
     geometry = arguments.geometry
     lever = max(1.0, geometry.upper_along_mm / geometry.joints_apart_mm)
-    gate_mm = max(arguments.position_gate_mm, _FIRST_GATE * lever * abs(arguments.move_um) / 1000)
+    reach_mm = _FIRST_GATE * lever * abs(arguments.move_um) / 1000
+    gate_mm = max(arguments.gate.position_gate_mm, reach_mm)
     return Expectation(before.plane_mm[:2], gate_mm), Expectation(before.plane_mm[2:], gate_mm)
 
 

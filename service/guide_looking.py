@@ -10,7 +10,13 @@ import numpy as np
 from service.estimate import FiducialEstimate
 from service.guide_geometry import GuideGeometry
 from service.plane import ImagePlane
-from service.sensing import Expectation, ProcedureFailedError, measure_again, measure_here
+from service.sensing import (
+    Expectation,
+    ProcedureFailedError,
+    ValidationGate,
+    measure_again,
+    measure_here,
+)
 from service.steps import Acquired, Measured, ProcedureSteps
 
 Expectations = tuple[Expectation | None, Expectation | None]
@@ -50,6 +56,35 @@ class BothSeen:
         return FiducialEstimate(dict(setpoints_um), state, covariance)
 
 
+@dataclass(frozen=True, eq=False)
+class GuideLook:
+    """What was seen from where the robot stands now.
+
+    found: from this look alone; prior: what was believed before it.
+    """
+
+    seen: BothSeen
+    found: FiducialEstimate
+    prior: FiducialEstimate
+
+    @property
+    def measurement_id(self) -> int:
+        return self.seen.measurement_id
+
+    @property
+    def frames(self) -> int:
+        """Slices of both together."""
+        return self.seen.frames
+
+    @property
+    def frames_of_each(self) -> int:
+        return self.seen.measured[0].frames
+
+    @property
+    def scan_s(self) -> float:
+        return self.seen.scan_s
+
+
 def see_both(
     geometry: GuideGeometry, expected: Expectations, *, fresh: bool = False
 ) -> ProcedureSteps[BothSeen]:
@@ -67,28 +102,33 @@ def see_both(
     return seen
 
 
-def see_longer(
-    geometry: GuideGeometry, seen: BothSeen, expected: Expectations, frames: int
-) -> ProcedureSteps[BothSeen]:
-    """Both again, from `frames` slices of each in all at the same hold."""
-    first, upper = yield from measure_again(
-        seen.acquired[0],
-        _METHOD,
-        expected[0],
-        frames=frames,
-        slice_position_mm=geometry.slice_positions_mm[0],
-    )
-    second, lower = yield from measure_again(
-        seen.acquired[1],
-        _METHOD,
-        expected[1],
-        frames=frames,
-        slice_position_mm=geometry.slice_positions_mm[1],
-    )
-    return BothSeen((first, second), (upper, lower))
+def look_at_guide(
+    geometry: GuideGeometry, prior: FiducialEstimate, gate: ValidationGate, *, fresh: bool
+) -> ProcedureSteps[GuideLook]:
+    """Look where both fiducials are believed to be."""
+    seen = yield from see_both(geometry, gates(prior, gate), fresh=fresh)
+    return GuideLook(seen, seen.at(prior.setpoints_um), prior)
 
 
-def gates(predicted: FiducialEstimate, least_gate_mm: float, sigmas: float) -> Expectations:
+def look_at_guide_longer(
+    geometry: GuideGeometry, look: GuideLook, gate: ValidationGate, *, frames: int
+) -> ProcedureSteps[GuideLook]:
+    """Look again with `frames` slices of each in all from the same hold."""
+    again = []
+    places = zip(
+        look.seen.acquired, gates(look.prior, gate), geometry.slice_positions_mm, strict=True
+    )
+    for acquired, expected, at_mm in places:
+        one = yield from measure_again(
+            acquired, _METHOD, expected, frames=frames, slice_position_mm=at_mm
+        )
+        again.append(one)
+    (first, upper), (second, lower) = again
+    seen = BothSeen((first, second), (upper, lower))
+    return GuideLook(seen, seen.at(look.prior.setpoints_um), look.prior)
+
+
+def gates(predicted: FiducialEstimate, gate: ValidationGate) -> Expectations:
     """Where each of the two must be, from a prediction of the state."""
     upper, lower = (
         FiducialEstimate(
@@ -96,7 +136,4 @@ def gates(predicted: FiducialEstimate, least_gate_mm: float, sigmas: float) -> E
         )
         for part in (slice(0, 2), slice(2, 4))
     )
-    return (
-        Expectation.of(upper, least_gate_mm, sigmas),
-        Expectation.of(lower, least_gate_mm, sigmas),
-    )
+    return gate.around(upper), gate.around(lower)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from room_config.load import Config
 from room_config.service import GuideConfig
 from service.calibration import Calibration
-from service.fiducial_plan import TARGET_SHARE
+from service.fiducial_plan import TARGET_SHARE, gate_of
 from service.guide_approach import GuideApproachArguments
 from service.guide_calibration import GuideCalibrationArguments
 from service.guide_geometry import GuideGeometry
@@ -44,24 +44,17 @@ def guide_calibration_of(
         origin_um=origin_um,
         move_um=move_um,
         geometry=geometry_of(guide),
-        position_gate_mm=config.imaging.position_gate_mm,
-        gate_sigma=config.service.prediction_gate_sigma,
-        repeatability_mm=config.service.repeatability_um / 1000,
-        scale_error=config.service.step_scale_error,
+        gate=gate_of(config),
     )
 
 
 def guide_recording_of(config: Config, guide: GuideConfig) -> GuideRecordingArguments:
     """Where the guide points now, the tip judged where a target usually lies."""
-    service = config.service
     return GuideRecordingArguments(
         geometry=geometry_of(guide),
         lower_plane_mm=guide.lower_plane_mm,
         sigma_mm=guide.tolerance_mm / TARGET_SHARE,
-        position_gate_mm=config.imaging.position_gate_mm,
-        gate_sigma=service.prediction_gate_sigma,
-        repeatability_mm=service.repeatability_um / 1000,
-        scale_error=service.step_scale_error,
+        gate=gate_of(config),
     )
 
 
@@ -99,8 +92,5 @@ def guide_approach_of(
         confidence=service.confidence,
         max_iterations=service.max_iterations,
         confirm_moves=service.confirm_moves,
-        position_gate_mm=config.imaging.position_gate_mm,
-        gate_sigma=service.prediction_gate_sigma,
-        repeatability_mm=service.repeatability_um / 1000,
-        scale_error=service.step_scale_error,
+        gate=gate_of(config),
     )

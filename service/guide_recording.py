@@ -8,11 +8,10 @@ from typing import Any
 import numpy as np
 
 from service.calibration import Calibration
-from service.estimate import FiducialEstimate, MotionNoise
 from service.guide_geometry import GuideGeometry, GuideSeenWrongError, line_of_state, tip_of
-from service.guide_looking import BothSeen, gates, see_both, see_longer
+from service.guide_looking import GuideLook, look_at_guide, look_at_guide_longer
 from service.kinematics import Line
-from service.sensing import ProcedureFailedError, check_prediction
+from service.sensing import ProcedureFailedError, ValidationGate, check_prediction
 from service.steps import ProcedureSteps
 
 _MOST_FRAMES = 8
@@ -28,10 +27,7 @@ class GuideRecordingArguments:
     geometry: GuideGeometry
     lower_plane_mm: float
     sigma_mm: float
-    position_gate_mm: float
-    gate_sigma: float
-    repeatability_mm: float
-    scale_error: float
+    gate: ValidationGate
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,29 +67,23 @@ def record_guide(
 ) -> ProcedureSteps[GuidePlace]:
     """Look at both fiducials where the robot stands, with as many slices as the bound asks for."""
     prior, geometry = start.estimate, arguments.geometry
-    expected = gates(prior, arguments.position_gate_mm, arguments.gate_sigma)
-    seen = yield from see_both(geometry, expected, fresh=True)
-    here = seen.at(prior.setpoints_um)
-    noise = MotionNoise(arguments.repeatability_mm, arguments.scale_error)
-    check_prediction(prior, here, arguments.gate_sigma, noise)
-    wanted = _slices_for(geometry, here, seen, arguments.sigma_mm)
-    if wanted > seen.measured[0].frames:
-        seen = yield from see_longer(geometry, seen, expected, wanted)
-        here = seen.at(prior.setpoints_um)
-    estimate = prior.fused_with(here.plane_mm, here.covariance_mm2)
-    calibration = replace(start, estimate=estimate, measurement_id=seen.measurement_id)
+    look = yield from look_at_guide(geometry, prior, arguments.gate, fresh=True)
+    check_prediction(prior, look.found, arguments.gate)
+    wanted = _slices_for(geometry, look, arguments.sigma_mm)
+    if wanted > look.frames_of_each:
+        look = yield from look_at_guide_longer(geometry, look, arguments.gate, frames=wanted)
+    estimate = prior.fused_with(look.found.plane_mm, look.found.covariance_mm2)
+    calibration = replace(start, estimate=estimate, measurement_id=look.measurement_id)
     try:
         line = line_of_state(geometry, estimate.plane_mm, start.plane, arguments.lower_plane_mm)
     except GuideSeenWrongError as wrong:
         raise ProcedureFailedError("guide", str(wrong)) from wrong
     sigma_mm = float(np.sqrt(np.trace(tip_of(geometry, estimate)[1]) / 2))
-    return GuidePlace(calibration, line, geometry.tip_beyond_mm, sigma_mm, seen.frames, seen.scan_s)
+    return GuidePlace(calibration, line, geometry.tip_beyond_mm, sigma_mm, look.frames, look.scan_s)
 
 
-def _slices_for(
-    geometry: GuideGeometry, here: FiducialEstimate, seen: BothSeen, sigma_mm: float
-) -> int:
+def _slices_for(geometry: GuideGeometry, look: GuideLook, sigma_mm: float) -> int:
     """Slices of each fiducial that bring the tip to `sigma_mm` by the bound, and never too many."""
-    frames = seen.measured[0].frames
-    worst = float(np.linalg.eigvalsh(tip_of(geometry, here)[1])[-1])
+    frames = look.frames_of_each
+    worst = float(np.linalg.eigvalsh(tip_of(geometry, look.found)[1])[-1])
     return min(_MOST_FRAMES, max(frames, int(np.ceil(frames * worst / sigma_mm**2))))

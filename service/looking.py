@@ -9,11 +9,11 @@ from types import MappingProxyType
 import numpy as np
 
 from service.calibration import Calibration
-from service.estimate import FiducialEstimate, MotionNoise
+from service.estimate import FiducialEstimate
 from service.plane import ImagePlane
 from service.sensing import (
-    Expectation,
     ProcedureFailedError,
+    ValidationGate,
     estimate_from,
     measure_again,
     measure_here,
@@ -55,14 +55,6 @@ STRATEGIES: Mapping[str, Strategy] = MappingProxyType(
 )
 
 
-@dataclass(frozen=True)
-class LookArguments:
-    position_gate_mm: float
-    gate_sigma: float
-    noise: MotionNoise
-    seed: int
-
-
 @dataclass(frozen=True, eq=False)
 class Look:
     """What was seen from where the robot stands now.
@@ -77,19 +69,36 @@ class Look:
     method: str
     acquired: Acquired | None
 
+    @property
+    def measurement_id(self) -> int:
+        return self.measured.measurement_id
+
+    @property
+    def frames(self) -> int:
+        return self.measured.frames
+
+    @property
+    def scan_s(self) -> float:
+        return self.measured.scan_s
+
 
 def look_at_fiducial(
-    way: Way, calibration: Calibration, arguments: LookArguments, *, number: int, fresh: bool
+    way: Way,
+    calibration: Calibration,
+    gate: ValidationGate,
+    *,
+    seed: tuple[int, int],
+    fresh: bool,
 ) -> ProcedureSteps[Look]:
-    """Look in one of the ways; `number` counts the looks, so that no two shift sets are alike."""
+    """Look in one of the ways; seed: of the shift set, with each look another one."""
     prior = calibration.estimate
-    expectation = Expectation.of(prior, arguments.position_gate_mm, arguments.gate_sigma)
+    expectation = gate.around(prior)
     if not way.shifted:
         acquired, measured = yield from measure_here(way.method, expectation, fresh=fresh)
         _check_plane(measured, calibration.plane)
         found = estimate_from(measured, prior.setpoints_um)
         return Look(measured, found, prior, way.method, acquired)
-    shifts_px = paper_random(np.random.default_rng((arguments.seed, number))).shifts_px
+    shifts_px = paper_random(np.random.default_rng(seed)).shifts_px
     result = yield from measure_shift_set(
         prior,
         shifts_px,
@@ -97,17 +106,17 @@ def look_at_fiducial(
         calibration.plane,
         way.method,
         expectation,
-        arguments.noise,
+        gate.noise,
     )
     _check_plane(result.measured, calibration.plane)
     return Look(result.measured, result.estimate, prior, way.method, None)
 
 
 def look_longer(
-    seen: Look, acquired: Acquired, arguments: LookArguments, *, frames: int
+    seen: Look, acquired: Acquired, gate: ValidationGate, *, frames: int
 ) -> ProcedureSteps[Look]:
     """Look again with `frames` slices in all from the same hold."""
-    expectation = Expectation.of(seen.prior, arguments.position_gate_mm, arguments.gate_sigma)
+    expectation = gate.around(seen.prior)
     more, measured = yield from measure_again(acquired, seen.method, expectation, frames=frames)
     found = estimate_from(measured, seen.prior.setpoints_um)
     return Look(measured, found, seen.prior, seen.method, more)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from typing import Any
 
 from case_record.record import CaseRecord
@@ -16,6 +16,7 @@ from service.guide_geometry import GuideGeometry
 from service.guide_recording import GuidePlace, GuideRecordingArguments, record_guide
 from service.jog import JogEnd, jog
 from service.recording import Place, RecordingArguments, record_place
+from service.sensing import ValidationGate
 from service.steps import ProcedureSteps
 
 CALIBRATION = "calibration"
@@ -27,6 +28,15 @@ GUIDE_RECORDING = "guide_recording"
 JOG = "jog"
 CALIBRATIONS, APPROACHES = (CALIBRATION, GUIDE_CALIBRATION), (APPROACH, GUIDE_APPROACH)
 
+Arguments = (
+    CalibrationArguments
+    | ApproachArguments
+    | RecordingArguments
+    | GuideCalibrationArguments
+    | GuideApproachArguments
+    | GuideRecordingArguments
+)
+
 
 def build_procedure(row: Procedure) -> ProcedureSteps[Any]:
     """Return a fresh generator of the recorded procedure; raises KeyError for an unknown name."""
@@ -34,27 +44,43 @@ def build_procedure(row: Procedure) -> ProcedureSteps[Any]:
 
 
 def calibration_arguments(arguments: CalibrationArguments) -> dict[str, Any]:
-    return asdict(arguments)
+    return _recorded(arguments)
 
 
 def approach_arguments(arguments: ApproachArguments, start: Calibration) -> dict[str, Any]:
-    return {"arguments": asdict(arguments), "start": start.to_json()}
+    return {"arguments": _recorded(arguments), "start": start.to_json()}
 
 
 def recording_arguments(
     arguments: RecordingArguments | GuideRecordingArguments, start: Calibration
 ) -> dict[str, Any]:
-    return {"arguments": asdict(arguments), "start": start.to_json()}
+    return {"arguments": _recorded(arguments), "start": start.to_json()}
 
 
 def guide_calibration_arguments(arguments: GuideCalibrationArguments) -> dict[str, Any]:
-    return asdict(arguments)
+    return _recorded(arguments)
 
 
 def guide_approach_arguments(
     arguments: GuideApproachArguments, start: Calibration
 ) -> dict[str, Any]:
-    return {"arguments": asdict(arguments), "start": start.to_json()}
+    return {"arguments": _recorded(arguments), "start": start.to_json()}
+
+
+def _recorded(arguments: Arguments) -> dict[str, Any]:
+    """As the record has them: the validation gate's numbers stand among the others."""
+    values = asdict(arguments)
+    gate: dict[str, Any] = values.pop("gate")
+    return {**values, **gate}
+
+
+def _with_gate(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments again, from what `_recorded` made of them."""
+    values = dict(recorded)
+    gate = ValidationGate(
+        **{field.name: values.pop(field.name) for field in fields(ValidationGate)}
+    )
+    return {**values, "gate": gate}
 
 
 def result_to_json(
@@ -84,20 +110,22 @@ def _build_calibration(value: Mapping[str, Any]) -> ProcedureSteps[Calibration]:
     first, second = value["axes"]
     shifts_px = tuple((row, col) for row, col in value["shifts_px"])
     return calibrate(
-        CalibrationArguments(**{**value, "axes": (first, second), "shifts_px": shifts_px})
+        CalibrationArguments(
+            **{**_with_gate(value), "axes": (first, second), "shifts_px": shifts_px}
+        )
     )
 
 
 def _build_approach(value: Mapping[str, Any]) -> ProcedureSteps[Arrival]:
-    fields = dict(value["arguments"])
-    row, col = fields["target_mm"]
-    travel_um = {axis: (low, high) for axis, (low, high) in fields["travel_um"].items()}
-    arguments = ApproachArguments(**{**fields, "target_mm": (row, col), "travel_um": travel_um})
+    known = _with_gate(value["arguments"])
+    row, col = known["target_mm"]
+    travel_um = {axis: (low, high) for axis, (low, high) in known["travel_um"].items()}
+    arguments = ApproachArguments(**{**known, "target_mm": (row, col), "travel_um": travel_um})
     return approach(arguments, Calibration.from_json(value["start"]))
 
 
 def _build_recording(value: Mapping[str, Any]) -> ProcedureSteps[Place]:
-    arguments = RecordingArguments(**value["arguments"])
+    arguments = RecordingArguments(**_with_gate(value["arguments"]))
     return record_place(arguments, Calibration.from_json(value["start"]))
 
 
@@ -110,21 +138,24 @@ def _build_guide_calibration(value: Mapping[str, Any]) -> ProcedureSteps[Calibra
     xt, yt, xb, yb = value["axes"]
     geometry = _guide_geometry(value["geometry"])
     return calibrate_guide(
-        GuideCalibrationArguments(**{**value, "axes": (xt, yt, xb, yb), "geometry": geometry})
+        GuideCalibrationArguments(
+            **{**_with_gate(value), "axes": (xt, yt, xb, yb), "geometry": geometry}
+        )
     )
 
 
 def _build_guide_approach(value: Mapping[str, Any]) -> ProcedureSteps[GuideArrival]:
-    fields = dict(value["arguments"])
-    fields["geometry"] = _guide_geometry(fields["geometry"])
-    fields["target_mm"] = tuple(fields["target_mm"])
-    fields["travel_um"] = {axis: (low, high) for axis, (low, high) in fields["travel_um"].items()}
-    return approach_guide(GuideApproachArguments(**fields), Calibration.from_json(value["start"]))
+    known = _with_gate(value["arguments"])
+    known["geometry"] = _guide_geometry(known["geometry"])
+    known["target_mm"] = tuple(known["target_mm"])
+    known["travel_um"] = {axis: (low, high) for axis, (low, high) in known["travel_um"].items()}
+    return approach_guide(GuideApproachArguments(**known), Calibration.from_json(value["start"]))
 
 
 def _build_guide_recording(value: Mapping[str, Any]) -> ProcedureSteps[GuidePlace]:
-    fields = {**value["arguments"], "geometry": _guide_geometry(value["arguments"]["geometry"])}
-    return record_guide(GuideRecordingArguments(**fields), Calibration.from_json(value["start"]))
+    known = _with_gate(value["arguments"])
+    known["geometry"] = _guide_geometry(known["geometry"])
+    return record_guide(GuideRecordingArguments(**known), Calibration.from_json(value["start"]))
 
 
 _BUILDERS: dict[str, Callable[[Mapping[str, Any]], ProcedureSteps[Any]]] = {

@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from service.calibration import Calibration
-from service.estimate import FiducialEstimate, MotionNoise
-from service.looking import STRATEGIES, Look, LookArguments, look_at_fiducial, look_longer
-from service.sensing import check_prediction
+from service.estimate import FiducialEstimate
+from service.looking import STRATEGIES, Look, look_at_fiducial, look_longer
+from service.sensing import ValidationGate, check_prediction
 from service.steps import ProcedureSteps
 
 _MOST_FRAMES = 8
@@ -23,15 +23,8 @@ class RecordingArguments:
 
     strategy: str
     sigma_mm: float
-    position_gate_mm: float
-    gate_sigma: float
-    repeatability_mm: float
-    scale_error: float
+    gate: ValidationGate
     seed: int = 0
-
-    @property
-    def noise(self) -> MotionNoise:
-        return MotionNoise(self.repeatability_mm, self.scale_error)
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,24 +61,21 @@ def record_place(arguments: RecordingArguments, start: Calibration) -> Procedure
     A strategy that fuses takes as many slices as the bound asks for; the paper's take one look.
     """
     strategy = STRATEGIES[arguments.strategy]
-    looking = LookArguments(
-        arguments.position_gate_mm, arguments.gate_sigma, arguments.noise, arguments.seed
-    )
-    look = yield from look_at_fiducial(strategy.fine, start, looking, number=0, fresh=True)
-    check_prediction(start.estimate, look.found, arguments.gate_sigma, arguments.noise)
+    gate, seed = arguments.gate, (arguments.seed, 0)
+    look = yield from look_at_fiducial(strategy.fine, start, gate, seed=seed, fresh=True)
+    check_prediction(start.estimate, look.found, gate)
     if not strategy.fuses or look.acquired is None:
         return _place(start, look.found, look)
-    wanted = slices_for(look.found, look.measured.frames, arguments.sigma_mm)
-    if wanted > look.measured.frames:
-        look = yield from look_longer(look, look.acquired, looking, frames=wanted)
+    wanted = slices_for(look.found, look.frames, arguments.sigma_mm)
+    if wanted > look.frames:
+        look = yield from look_longer(look, look.acquired, gate, frames=wanted)
     estimate = look.prior.fused_with(look.found.plane_mm, look.found.covariance_mm2)
     return _place(start, estimate, look)
 
 
 def _place(start: Calibration, estimate: FiducialEstimate, look: Look) -> Place:
-    measured = look.measured
-    calibration = replace(start, estimate=estimate, measurement_id=measured.measurement_id)
-    return Place(calibration, measured.frames, measured.scan_s)
+    calibration = replace(start, estimate=estimate, measurement_id=look.measurement_id)
+    return Place(calibration, look.frames, look.scan_s)
 
 
 def slices_for(found: FiducialEstimate, frames: int, sigma_mm: float) -> int:

@@ -9,8 +9,8 @@ from fastapi import APIRouter, Request, Response
 from service.access import Access, Identity
 from service.bodies import LoginBody, SessionBody
 from service.gate import COOKIE, check_token, session_secret, unauthorized
+from service.orders import Caller
 from service.problems import ProblemError, responses
-from service.routes_command import Caller
 
 
 def access_router(access: Access, *, uses_tls: bool) -> APIRouter:

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
-from fastapi import APIRouter, Header, Query, Response
+from fastapi import APIRouter, Depends, Header, Query, Response
 from numpy.typing import NDArray
 
 from case_record.record import CaseRecord
@@ -19,13 +19,20 @@ from service.images import (
     slice_file,
     slice_pixels,
 )
+from service.parameters import Id
 from service.problems import responses
-from service.routes_record import Id
 
 Window = Annotated[float | None, Query(gt=0, le=1e9, allow_inf_nan=False)]
 Level = Annotated[float | None, Query(ge=-1e9, le=1e9, allow_inf_nan=False)]
 Scale = Annotated[int, Query(ge=1, le=8, description="Each pixel becomes this many squared.")]
 Match = Annotated[str | None, Header(alias="If-None-Match")]
+
+
+async def _rendering(window: Window = None, level: Level = None, scale: Scale = 1) -> Rendering:
+    return Rendering(window, level, scale)
+
+
+How = Annotated[Rendering, Depends(_rendering)]
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 
 
@@ -46,27 +53,18 @@ def slice_image_router(case_dir: Path) -> APIRouter:
     router = APIRouter(tags=["images"], prefix="/api/v1/slices/{slice_id}")
 
     @router.get("/image.png", response_class=Response, responses=_PNG)
-    def slice_image(
-        slice_id: Id,
-        window: Window = None,
-        level: Level = None,
-        scale: Scale = 1,
-        match: Match = None,
-    ) -> Response:
+    def slice_image(slice_id: Id, how: How, match: Match = None) -> Response:
         """The slice as an 8-bit PNG; window and level in the units of its magnitudes."""
         with CaseRecord(case_dir) as record:
-            key = f"png {record.slice(slice_id).sha256} {slice_id} {window} {level} {scale}"
-            how = Rendering(window, level, scale)
-            return _answer(
-                key, match, "image/png", lambda: png_of(slice_pixels(record, slice_id), how)
-            )
+            image = f"{record.slice(slice_id).sha256} {slice_id}"
+            return _png(image, lambda: slice_pixels(record, slice_id), how, match)
 
     @router.get("/pixels", response_class=Response, responses=_RAW)
     def raw_slice(slice_id: Id, match: Match = None) -> Response:
         """The magnitudes, row by row, little-endian 32-bit floats; `X-Shape: rows,cols`."""
         with CaseRecord(case_dir) as record:
-            key = f"raw {record.slice(slice_id).sha256} {slice_id}"
-            return _raw_answer(key, match, slice_pixels(record, slice_id))
+            image = f"{record.slice(slice_id).sha256} {slice_id}"
+            return _raw(image, slice_pixels(record, slice_id), match)
 
     @router.get("/image.dcm", response_class=Response, responses=_DICOM)
     def dicom_file(slice_id: Id, match: Match = None) -> Response:
@@ -83,27 +81,21 @@ def slice_image_router(case_dir: Path) -> APIRouter:
 def measurement_image_router(case_dir: Path) -> APIRouter:
     router = APIRouter(tags=["images"], prefix="/api/v1/measurements/{measurement_id}")
 
-    @router.get("/image.png", response_class=Response, responses=_PNG)
-    def measurement_image(
-        measurement_id: Id,
-        window: Window = None,
-        level: Level = None,
-        scale: Scale = 1,
-        match: Match = None,
-    ) -> Response:
-        """The super-resolution reconstruction of a measurement as an 8-bit PNG."""
+    def pixels_of(measurement_id: int) -> NDArray[Any]:
         with CaseRecord(case_dir) as record:
-            pixels = reconstruction_pixels(record, measurement_id)
-        key = f"png {case_dir} measurement {measurement_id} {window} {level} {scale}"
-        how = Rendering(window, level, scale)
-        return _answer(key, match, "image/png", lambda: png_of(pixels, how))
+            return reconstruction_pixels(record, measurement_id)
+
+    @router.get("/image.png", response_class=Response, responses=_PNG)
+    def measurement_image(measurement_id: Id, how: How, match: Match = None) -> Response:
+        """The super-resolution reconstruction of a measurement as an 8-bit PNG."""
+        pixels = pixels_of(measurement_id)
+        return _png(f"{case_dir} measurement {measurement_id}", lambda: pixels, how, match)
 
     @router.get("/pixels", response_class=Response, responses=_RAW)
     def raw_measurement(measurement_id: Id, match: Match = None) -> Response:
         """The reconstruction as little-endian 32-bit floats; `X-Shape: rows,cols`."""
-        with CaseRecord(case_dir) as record:
-            pixels = reconstruction_pixels(record, measurement_id)
-        return _raw_answer(f"raw {case_dir} measurement {measurement_id}", match, pixels)
+        pixels = pixels_of(measurement_id)
+        return _raw(f"{case_dir} measurement {measurement_id}", pixels, match)
 
     return router
 
@@ -119,6 +111,15 @@ def _answer(
     return Response(make(), media_type=media_type, headers={**cached, **headers})
 
 
-def _raw_answer(key: str, match: str | None, pixels: NDArray[Any]) -> Response:
+def _png(
+    image: str, pixels: Callable[[], NDArray[Any]], how: Rendering, match: str | None
+) -> Response:
+    key = f"png {image} {how.window} {how.level} {how.scale}"
+    return _answer(key, match, "image/png", lambda: png_of(pixels(), how))
+
+
+def _raw(image: str, pixels: NDArray[Any], match: str | None) -> Response:
     shape = {"X-Shape": ",".join(map(str, pixels.shape))}
-    return _answer(key, match, "application/octet-stream", lambda: raw_of(pixels), **shape)
+    return _answer(
+        f"raw {image}", match, "application/octet-stream", lambda: raw_of(pixels), **shape
+    )

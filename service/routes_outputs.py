@@ -19,8 +19,8 @@ from service.finding import finding_of_arrival, finding_of_measurement, finding_
 from service.images import ImageMissingError
 from service.outbox_store import FILE_NAME, STATES, OutboxStore, State
 from service.outputs import FOLDER, Kind, Output
+from service.parameters import Id
 from service.problems import ProblemError, responses
-from service.routes_record import Id
 
 _PATIENCE_S = 180.0
 _TURN_S = 20.0

@@ -1,73 +1,24 @@
-"""What the record says: state, events, slices, measurements, cases."""
+"""What the record says: events, slices, measurements, targets, cases."""
 
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated
 
-from fastapi import APIRouter, Header, Query, Request, Response
-from fastapi import Path as PathParameter
-from fastapi.responses import StreamingResponse
+from fastapi import APIRouter, Query, Request, Response
 
 from case_record.record import CaseRecord
 from case_record.rows import SliceRow
 from service.bodies import CaseSummary, EventBody, KnownTarget, MeasurementBody, SliceBody
-from service.control import ControlLoop
-from service.live import Broadcast
+from service.parameters import ERRORS, ERRORS_WITH_ID, After, Id, Limit, Newest, link_onward
 from service.past import known_targets, past_cases, targets_over_time
-from service.problems import responses
-from service.state import RoomState
-
-_MOST_ID = 2**53
-Id = Annotated[int, PathParameter(ge=1, le=_MOST_ID)]
-After = Annotated[
-    int, Query(ge=0, le=_MOST_ID, description="Begin after this id (before it with `newest`).")
-]
-Limit = Annotated[int, Query(ge=1, le=1000)]
-Newest = Annotated[bool, Query(description="The newest first instead of the oldest first.")]
-_ERRORS = responses(401, 422, 429)
-_WITH_ID = responses(401, 404, 422, 429)
 
 
-def live_router(loop: ControlLoop, broadcast: Broadcast) -> APIRouter:
-    router = APIRouter(tags=["live"])
+def event_router(case_dir: Path) -> APIRouter:
+    """What happened, in this case and in those before it."""
+    router = APIRouter(prefix="/api/v1", tags=["record"])
 
-    @router.get("/api/v1/state", response_model=RoomState, responses=_ERRORS)
-    async def state() -> Response:
-        """What the room is doing now."""
-        # the state was checked when it was made; many ask for it often
-        return Response(loop.state.model_dump_json(), media_type="application/json")
-
-    @router.get(
-        "/api/v1/events/live",
-        response_class=StreamingResponse,
-        responses={
-            **_ERRORS,
-            200: {
-                "description": "Server-sent events: `state`, `record` (id: event id), `beat`",
-                "content": {"text/event-stream": {"schema": {"type": "string"}}},
-            },
-        },
-    )
-    async def live(
-        after: After = 0,
-        last_event_id: Annotated[str | None, Header(alias="Last-Event-ID")] = None,
-    ) -> StreamingResponse:
-        """The state whenever it changes, every event of the record after the given one."""
-        if last_event_id is not None and last_event_id.isdecimal():
-            after = min(int(last_event_id), _MOST_ID)
-        headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
-        return StreamingResponse(
-            broadcast.follow(after), media_type="text/event-stream", headers=headers
-        )
-
-    return router
-
-
-def record_router(case_dir: Path) -> APIRouter:
-    router = APIRouter(tags=["record"])
-
-    @router.get("/api/v1/events", responses=_ERRORS)
+    @router.get("/events", responses=ERRORS)
     def events(
         request: Request,
         response: Response,
@@ -82,7 +33,7 @@ def record_router(case_dir: Path) -> APIRouter:
                 if newest
                 else record.events(after, limit)
             )
-        _link(request, response, [e.event_id for e in found], limit)
+        link_onward(request, response, [e.event_id for e in found], limit)
         return [
             EventBody(
                 event_id=e.event_id,
@@ -95,7 +46,19 @@ def record_router(case_dir: Path) -> APIRouter:
             for e in found
         ]
 
-    @router.get("/api/v1/slices", responses=_ERRORS)
+    @router.get("/cases", responses=ERRORS)
+    def cases() -> list[CaseSummary]:
+        """The case folders beside the present one, newest first."""
+        return past_cases(case_dir)
+
+    return router
+
+
+def slice_router(case_dir: Path) -> APIRouter:
+    """The slices that were received."""
+    router = APIRouter(prefix="/api/v1", tags=["record"])
+
+    @router.get("/slices", responses=ERRORS)
     def slices(
         request: Request,
         response: Response,
@@ -107,16 +70,23 @@ def record_router(case_dir: Path) -> APIRouter:
         """Every slice that was received, with what was decided about it and by whom."""
         with CaseRecord(case_dir) as record:
             rows = record.page_of_slices(after_id=after, limit=limit, newest=newest, state=state)
-        _link(request, response, [row.slice_id for row in rows], limit)
+        link_onward(request, response, [row.slice_id for row in rows], limit)
         return [_slice_body(row) for row in rows]
 
-    @router.get("/api/v1/slices/{slice_id}", responses=_WITH_ID)
+    @router.get("/slices/{slice_id}", responses=ERRORS_WITH_ID)
     def one_slice(slice_id: Id) -> SliceBody:
         """One slice."""
         with CaseRecord(case_dir) as record:
             return _slice_body(record.slice(slice_id))
 
-    @router.get("/api/v1/measurements", responses=_ERRORS)
+    return router
+
+
+def measurement_router(case_dir: Path) -> APIRouter:
+    """What was measured, and how far that was from which target."""
+    router = APIRouter(prefix="/api/v1", tags=["record"])
+
+    @router.get("/measurements", responses=ERRORS)
     def measurements(
         request: Request,
         response: Response,
@@ -128,27 +98,16 @@ def record_router(case_dir: Path) -> APIRouter:
         with CaseRecord(case_dir) as record:
             rows = record.page_of_measurements(after_id=after, limit=limit, newest=newest)
             targets = targets_over_time(record)
-        _link(request, response, [row.measurement_id for row in rows], limit)
+        link_onward(request, response, [row.measurement_id for row in rows], limit)
         return [targets.body_of(row) for row in rows]
 
-    @router.get("/api/v1/targets", responses=_ERRORS)
+    @router.get("/targets", responses=ERRORS)
     def targets() -> list[KnownTarget]:
         """Every target of the case in the order in which they were set, with its approaches."""
         with CaseRecord(case_dir) as record:
             return known_targets(record)
 
-    @router.get("/api/v1/cases", responses=_ERRORS)
-    def cases() -> list[CaseSummary]:
-        """The case folders beside the present one, newest first."""
-        return past_cases(case_dir)
-
     return router
-
-
-def _link(request: Request, response: Response, ids: list[int], limit: int) -> None:
-    if len(ids) == limit:
-        onward = request.url.include_query_params(after=ids[-1])
-        response.headers["Link"] = f'<{onward.path}?{onward.query}>; rel="next"'
 
 
 def _slice_body(row: SliceRow) -> SliceBody:

@@ -48,10 +48,28 @@ class Expectation:
     plane_mm: Array
     gate_mm: float
 
-    @classmethod
-    def of(cls, estimate: FiducialEstimate, least_gate_mm: float, sigmas: float) -> Expectation:
-        worst = float(np.sqrt(np.linalg.eigvalsh(estimate.covariance_mm2)[-1]))
-        return cls(estimate.plane_mm, max(least_gate_mm, sigmas * worst))
+
+@dataclass(frozen=True)
+class ValidationGate:
+    """Which measurements are believed: those near enough to what was predicted.
+
+    position_gate_mm: how far off is near enough in any case; gate_sigma: of the prediction's and
+    the measurement's uncertainty. repeatability_mm, scale_error: of the motors (MotionNoise).
+    """
+
+    position_gate_mm: float
+    gate_sigma: float
+    repeatability_mm: float
+    scale_error: float
+
+    @property
+    def noise(self) -> MotionNoise:
+        return MotionNoise(self.repeatability_mm, self.scale_error)
+
+    def around(self, predicted: FiducialEstimate) -> Expectation:
+        """Where the fiducial is looked for."""
+        worst = float(np.sqrt(np.linalg.eigvalsh(predicted.covariance_mm2)[-1]))
+        return Expectation(predicted.plane_mm, max(self.position_gate_mm, self.gate_sigma * worst))
 
 
 def move(step: MoveTo) -> ProcedureSteps[Moved]:
@@ -222,16 +240,16 @@ def estimate_from(measured: Measured, setpoints_um: Mapping[str, int]) -> Fiduci
 
 
 def check_prediction(
-    predicted: FiducialEstimate, found: FiducialEstimate, gate_sigma: float, noise: MotionNoise
+    predicted: FiducialEstimate, found: FiducialEstimate, gate: ValidationGate
 ) -> None:
     """Refuse to go on when a move did not do what was predicted: wrong sign, wrong scale, slip.
 
-    gate_sigma: in two dimensions; with more of them, what is as improbable by chance.
+    The gate's sigma is in two dimensions; with more of them, what is as improbable by chance.
     """
     sigmas = predicted.distance_sigma(found.plane_mm, found.covariance_mm2)
-    allowed = gate_sigma
+    allowed = gate.gate_sigma
     if len(found.plane_mm) != 2:
-        allowed = math.sqrt(chi2.isf(chi2.sf(gate_sigma**2, 2), len(found.plane_mm)))
+        allowed = math.sqrt(chi2.isf(chi2.sf(gate.gate_sigma**2, 2), len(found.plane_mm)))
     if not sigmas <= allowed:
         miss = found.plane_mm - predicted.plane_mm
         listed = ", ".join(f"{value:+.3f}" for value in miss)
@@ -239,7 +257,7 @@ def check_prediction(
             "prediction_missed",
             f"the fiducial is ({listed}) mm (row, col) from where the move should have brought "
             f"it, {sigmas:.1f} σ (allowed {allowed:.1f}, repeatability "
-            f"{noise.repeatability_mm * 1000:.0f} µm): calibrate again",
+            f"{gate.repeatability_mm * 1000:.0f} µm): calibrate again",
         )
 
 

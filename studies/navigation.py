@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 
 from service.approach import PAPER, PROBABILITY, ApproachArguments, Arrival, approach
 from service.calibration import Calibration, CalibrationArguments, calibrate
-from service.estimate import MotionNoise
 from service.looking import STRATEGIES
 from service.recording import RecordingArguments, record_place
-from service.sensing import ProcedureFailedError, move
+from service.sensing import ProcedureFailedError, ValidationGate, move
 from service.steps import MoveTo, ProcedureSteps
 from simulator.camera import Camera
 from simulator.config import SliceProtocol, VirtualRoom
@@ -181,10 +180,7 @@ def _recording_arguments(group: Group) -> RecordingArguments:
     return RecordingArguments(
         strategy=group.strategy,
         sigma_mm=TOLERANCE_MM / 5,
-        position_gate_mm=3.0,
-        gate_sigma=5.0,
-        repeatability_mm=_noise(group).repeatability_mm,
-        scale_error=_noise(group).scale_error,
+        gate=_gate(group),
         seed=group.seed,
     )
 
@@ -196,7 +192,7 @@ def _go_away(
     setpoints_um = dict(zip(AXES, point_um, strict=True))
     moved = yield from move(MoveTo(setpoints_um, "random point"))
     estimate = calibration.estimate.moved_to(
-        moved.readback_um, calibration.jacobian, arguments.noise
+        moved.readback_um, calibration.jacobian, arguments.gate.noise
     )
     return replace(calibration, estimate=estimate)
 
@@ -218,10 +214,7 @@ def _calibration_arguments(group: Group) -> CalibrationArguments:
         origin_um=dict.fromkeys(AXES, 0),
         move_um=CALIBRATION_MOVE_UM,
         shifts_px=((0.0, 0.0),),
-        position_gate_mm=3.0,
-        gate_sigma=5.0,
-        repeatability_mm=_noise(group).repeatability_mm,
-        scale_error=_noise(group).scale_error,
+        gate=_gate(group),
         method="ml" if STRATEGIES[group.strategy].fuses else "base",
     )
 
@@ -235,16 +228,18 @@ def _approach_arguments(group: Group, target_mm: Array, number: int) -> Approach
         confidence=0.95,
         max_iterations=10,
         confirm_moves=False,
-        position_gate_mm=3.0,
-        gate_sigma=5.0,
-        repeatability_mm=_noise(group).repeatability_mm,
-        scale_error=_noise(group).scale_error,
+        gate=_gate(group),
         strategy=group.strategy,
         stop_rule=PROBABILITY if STRATEGIES[group.strategy].fuses else PAPER,
         seed=group.seed * 1000 + number,
     )
 
 
-def _noise(group: Group) -> MotionNoise:
+def _gate(group: Group) -> ValidationGate:
     """What the procedures are told of the motors: half as much again as is true of the scatter."""
-    return MotionNoise(0.014, 1.5 * group.step_scatter + 0.001)
+    return ValidationGate(
+        position_gate_mm=3.0,
+        gate_sigma=5.0,
+        repeatability_mm=0.014,
+        scale_error=1.5 * group.step_scatter + 0.001,
+    )

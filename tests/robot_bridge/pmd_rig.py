@@ -130,7 +130,8 @@ def opened(made: Rig, drive: str = "open_loop", declare: bool = True, **changes:
         axis_config(name, made.url, address, drives[address - 1], **changes)
         for name, address in (("xt", 1), ("yt", 2))
     ]
-    motors = PmdMotors(axes, **options)
+    # The emulator is a thread of this process; on a busy computer its answers take long.
+    motors = PmdMotors(axes, timeout_s=0.5, **options)
     try:
         motors.open()
         if declare:

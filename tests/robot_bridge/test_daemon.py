@@ -211,12 +211,18 @@ def test_the_end_of_the_parent_ends_the_daemon_with_standing_motors(tmp_path: Pa
         assert daemon.wait(5) == 0
 
 
-def test_an_unplugged_line_stops_the_motion_within_the_deadman(shared_room: BridgeRoom):
+def test_an_unplugged_line_stops_the_motion_and_the_bridge_says_why(shared_room: BridgeRoom):
+    """After exactly how long: test_client, in virtual time."""
     room = shared_room
     client = room.ready_client()
     begin_long_move(room, client)
     room.line.unplug()
-    assert_stands(room, within_s=1.2)
+    assert_stands(room, within_s=60)
+    wait_for(lambda: room.status_file()["stopped"], 60, "the latched stop")
+    health = room.status_file()
+    assert health["stop_reason"] == "link_lost"
+    assert health["armed"] is False
+    assert health["moving"] is False
 
 
 def test_the_insertion_lock_survives_kill_9(tmp_path: Path):

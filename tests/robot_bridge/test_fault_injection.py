@@ -43,7 +43,9 @@ def test_no_fault_of_line_or_process_moves_wrongly_or_twice(tmp_path: Path, seed
 def test_no_seed_finds_harm(seed: int):
     """Whatever the seed; hypothesis keeps the one that fails."""
     with tempfile.TemporaryDirectory() as folder:
-        run(Path(folder), seed, 50)
+        findings = run(Path(folder), seed, 50).findings
+        assert set(findings.harm.values()) == {0}
+        assert sum(findings.states.values()) >= 50
 
 
 @pytest.mark.parametrize("baud", [115200, 57600])

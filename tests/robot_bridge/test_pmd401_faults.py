@@ -239,7 +239,7 @@ def test_a_lost_answer_to_a_run_that_did_start_is_found_out():
 
 
 def test_a_dead_controller_is_named_and_the_other_stops():
-    with rig(speed_factor=2.0) as made, opened(made) as motors:
+    with rig(speed_factor=0.5) as made, opened(made) as motors:
         in_motion(motors, made)
         with made.lock:
             made.controller(1).faults.dead = True
@@ -349,7 +349,12 @@ def test_parking_and_declaring_are_possible_in_spite_of_a_fault():
         wait_until(motors, lambda s: s.fault == "overheat")
         motors.park()
         wait_until(motors, lambda s: s.parked)
+        assert all(controller.parked for controller in made.bus.controllers)
         motors.declare_position({"xt": 5})
+        status = motors.poll()
+        assert status.readback_um == {"xt": 5, "yt": 0}
+        assert status.certain
+        assert made.runs() == 0
 
 
 def test_a_port_that_comes_back_is_opened_again_and_the_position_is_uncertain(tmp_path):

@@ -7,6 +7,7 @@ from pmd_rig import axis_config, finish, opened, rig, wait_until
 from virtual_line import VirtualLine
 
 from robot_bridge.emulator_axis import Motor
+from robot_bridge.emulator_runs import OpenRun
 from robot_bridge.motors import POLL_BOUND_S, STOP_BOUND_S, MotorError
 from robot_bridge.pmd401 import UNTRIED, PmdMotors
 
@@ -114,44 +115,57 @@ def test_opening_moves_nothing_and_warns_that_it_is_untried():
         assert made.causes == []
 
 
+# Bounds of time are held on the line's own clock: what a busy computer adds is not the driver's.
+
+
 def test_stop_ends_the_motion_of_all_axes_at_once():
-    with rig(speed_factor=1.0) as made, opened(made) as motors:
-        motors.move_to({"xt": 15_000, "yt": 15_000})
-        wait_until(motors, lambda s: s.readback_um["xt"] > 500)
-        begun_s = time.monotonic()
-        motors.stop()
-        assert time.monotonic() - begun_s < STOP_BOUND_S
-        with made.lock:
-            assert not any(c.moving for c in made.bus.controllers)
-        stood_um = made.position_um(1)
-        status = motors.poll()
-        assert not status.moving
-        assert not status.certain  # an open-loop run that was cut short cannot be accounted for
-        time.sleep(0.05)
-        assert made.position_um(1) == stood_um
+    line = VirtualLine({"xt": "open_loop", "yt": "open_loop"})
+    line.open_at_zero()
+    line.motors.move_to({"xt": 15_000, "yt": 15_000})
+    while line.poll().readback_um["xt"] <= 500:
+        assert line.position_um() < 14_000
+    begun_s = line.now_s
+    line.motors.stop()
+    assert line.now_s - begun_s < STOP_BOUND_S
+    assert not line.moving()
+    stood_um = line.position_um()
+    status = line.motors.poll()
+    assert not status.moving
+    assert not status.certain  # an open-loop run that was cut short cannot be accounted for
+    line.wait(1.0)
+    assert line.position_um() == stood_um
 
 
 def test_stop_works_before_open_and_again_and_again():
-    with rig() as made:
-        motors = PmdMotors([axis_config("xt", made.url, 1), axis_config("yt", made.url, 2)])
-        motors.stop()
-        motors.stop()
-        motors.close()
+    line = VirtualLine({"xt": "open_loop", "yt": "open_loop"})
+    for _ in range(2):
+        let_run(line)
+        line.motors.stop()
+        assert not line.moving()
+    line.motors.stop()
+    assert not line.motors.poll().moving
+
+
+def let_run(line: VirtualLine) -> None:
+    """Somebody else's open-loop run, far longer than any test."""
+    line.controller().unpark()
+    line.wait(1.0)
+    line.controller().begin_open_run(OpenRun(10**9, 1, 100.0), "run")
+    assert line.moving()
 
 
 def test_stop_says_which_axis_did_not_confirm():
-    with rig() as made, opened(made) as motors:
-        with made.lock:
-            made.controller(2).faults.dead = True
-        begun_s = time.monotonic()
-        with pytest.raises(MotorError, match="yt") as caught:
-            motors.stop()
-        assert caught.value.code == "stop_unconfirmed"
-        assert time.monotonic() - begun_s < STOP_BOUND_S
+    line = VirtualLine({"xt": "open_loop", "yt": "open_loop"})
+    line.open_at_zero()
+    line.controller(2).faults.dead = True
+    begun_s = line.now_s
+    with pytest.raises(MotorError, match="yt") as caught:
+        line.motors.stop()
+    assert caught.value.code == "stop_unconfirmed"
+    assert line.now_s - begun_s < STOP_BOUND_S
 
 
 def test_no_poll_takes_longer_than_its_bound():
-    """On the line's own clock: what a busy computer adds is not the driver's."""
     line = VirtualLine({"xt": "closed_loop", "yt": "closed_loop"})
     line.bus.faults.drop_probability = 0.02
     line.open_at_zero()

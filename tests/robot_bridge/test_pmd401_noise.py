@@ -5,6 +5,7 @@ run twice; stop at an echo that nobody asked for; believe nothing less than the 
 """
 
 import logging
+from dataclasses import dataclass, field
 
 import pytest
 from hypothesis import given, settings
@@ -12,7 +13,7 @@ from hypothesis import strategies as st
 from virtual_line import VirtualLine
 
 from robot_bridge.emulator_switches import LineFaults, Switches
-from robot_bridge.motors import MotorError
+from robot_bridge.motors import MotorError, MotorStatus
 
 DAMAGE = (
     "drop_replies",
@@ -62,15 +63,28 @@ def test_damage_at_any_place_of_a_move_never_moves_twice_or_elsewhere(drive: str
     assert None in faults  # damage is survived wherever repeating is safe
 
 
+@dataclass
+class Noisy:
+    """What came of moves on a noisy line."""
+
+    arrived: int = 0
+    failed: int = 0
+    lies: list[str] = field(default_factory=list)  # certain to be where the stage is not
+    runs_most: int = 0  # in one move
+
+    @property
+    def moves(self) -> int:
+        return self.arrived + self.failed
+
+
 def noisy_moves(
     seed: int, drives: dict[str, str], faults: LineFaults, moves: int, bare_status: bool = True
-) -> tuple[int, int]:
-    """Many moves on a noisy line; returns how many arrived and how many did not."""
+) -> Noisy:
     switches = Switches(bare_status=bare_status)
     line = VirtualLine(drives, seed=seed, switches=switches)
     line.open_at_zero()
     line.bus.faults = faults
-    arrived = failed = 0
+    found = Noisy()
     for number in range(moves):
         setpoints_um = {
             name: ((seed + 7919 * number + 104_729 * k) % 4001) - 2000
@@ -81,16 +95,15 @@ def noisy_moves(
         try:
             line.motors.move_to(setpoints_um)
         except MotorError:
-            failed += 1
+            found.failed += 1
             continue
         line.finish()
         status = line.poll(3)
-        assert_no_lie(line, setpoints_um, status)
-        if all(drive == "open_loop" for drive in drives.values()):
-            # Two legs an axis; what noise alone begins (`J1` for `B1`) is stopped at its echo.
-            assert line.runs() - runs <= 3 * len(drives)
-        arrived, failed = arrived + status.reached, failed + (not status.reached)
-    return arrived, failed
+        found.lies += lies(line, setpoints_um, status)
+        found.runs_most = max(found.runs_most, line.runs() - runs)
+        found.arrived += status.reached
+        found.failed += not status.reached
+    return found
 
 
 def start_again_if_needed(line: VirtualLine, drives: dict[str, str]) -> None:
@@ -107,12 +120,15 @@ def start_again_if_needed(line: VirtualLine, drives: dict[str, str]) -> None:
             continue
 
 
-def assert_no_lie(line: VirtualLine, setpoints_um: dict[str, int], status) -> None:
-    """If the driver says that it stands at its setpoints for certain, then it does."""
+def lies(line: VirtualLine, setpoints_um: dict[str, int], status: MotorStatus) -> list[str]:
+    """Axes of which the driver says that they stand at their setpoints for certain, but do not."""
     if not (status.reached and status.certain and status.fault is None):
-        return
-    for address, setpoint_um in enumerate(setpoints_um.values(), 1):
-        assert line.position_um(address) == pytest.approx(setpoint_um, abs=20), status
+        return []
+    return [
+        f"{name} is at {line.position_um(address):.0f} um: {status}"
+        for address, (name, setpoint_um) in enumerate(setpoints_um.items(), 1)
+        if not abs(line.position_um(address) - setpoint_um) <= 20
+    ]
 
 
 @settings(max_examples=15, deadline=None)
@@ -121,7 +137,12 @@ def test_on_a_noisy_line_the_driver_never_claims_to_be_where_it_is_not(seed: int
     faults = LineFaults(
         drop_probability=0.01, garble_probability=0.01, garble_command_probability=0.01
     )
-    noisy_moves(seed, {"xt": drive}, faults, moves=8)
+    found = noisy_moves(seed, {"xt": drive}, faults, moves=8)
+    assert found.lies == []
+    assert found.moves == 8
+    if drive == "open_loop":
+        # Two legs; what noise alone begins (`J1` for `B1`) is stopped at its echo.
+        assert found.runs_most <= 3
 
 
 @settings(max_examples=8, deadline=None)
@@ -129,14 +150,18 @@ def test_on_a_noisy_line_the_driver_never_claims_to_be_where_it_is_not(seed: int
 def test_two_axes_on_one_noisy_bus(seed: int, bare_status: bool):
     faults = LineFaults(drop_probability=0.01, garble_command_probability=0.01)
     drives = {"xt": "open_loop", "yt": "closed_loop"}
-    noisy_moves(seed, drives, faults, moves=6, bare_status=bare_status)
+    found = noisy_moves(seed, drives, faults, moves=6, bare_status=bare_status)
+    assert found.lies == []
+    assert found.moves == 6
 
 
 def test_a_slightly_noisy_line_still_gets_most_moves_done():
     faults = LineFaults(drop_probability=0.001, garble_probability=0.001)
-    arrived, failed = noisy_moves(5, {"xt": "open_loop", "yt": "open_loop"}, faults, moves=60)
-    assert arrived + failed == 60
-    assert arrived >= 45
+    found = noisy_moves(5, {"xt": "open_loop", "yt": "open_loop"}, faults, moves=60)
+    assert found.lies == []
+    assert found.moves == 60
+    assert found.arrived >= 45
+    assert found.runs_most <= 6  # two legs an axis, and what noise may begin
 
 
 @pytest.mark.soak
@@ -154,4 +179,9 @@ def test_many_noisy_lines(seed: int, drive: str, noise: float, bare_status: bool
     faults = LineFaults(
         drop_probability=noise, garble_probability=noise, garble_command_probability=noise
     )
-    noisy_moves(seed, {"xt": drive, "yt": drive}, faults, moves=10, bare_status=bare_status)
+    drives = {"xt": drive, "yt": drive}
+    found = noisy_moves(seed, drives, faults, moves=10, bare_status=bare_status)
+    assert found.lies == []
+    assert found.moves == 10
+    if drive == "open_loop":
+        assert found.runs_most <= 6

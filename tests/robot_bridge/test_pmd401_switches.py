@@ -42,7 +42,8 @@ def differing(switches: Switches) -> str:
     return ",".join(changed) or "standard"
 
 
-def works_in_whole(switches: Switches) -> None:
+@pytest.mark.parametrize("switches", [*SINGLE, *COMBINED], ids=differing)
+def test_every_switch_alone_and_in_combination_leaves_a_driver_that_works(switches: Switches):
     """Opening, moves both ways in either kind of loop, parking, a move from parked, stopping."""
     with rig(switches=switches) as made, opened(made, "mixed") as motors:
         for setpoint_um in (900, -300):
@@ -58,16 +59,6 @@ def works_in_whole(switches: Switches) -> None:
         assert finish(motors).reached
         motors.stop()
         assert motors.poll().certain
-
-
-@pytest.mark.parametrize("switches", SINGLE, ids=differing)
-def test_each_switch_alone(switches: Switches):
-    works_in_whole(switches)
-
-
-@pytest.mark.parametrize("switches", COMBINED, ids=differing)
-def test_combinations_of_switches(switches: Switches):
-    works_in_whole(switches)
 
 
 def test_the_other_model():

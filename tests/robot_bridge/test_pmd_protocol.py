@@ -133,9 +133,11 @@ def test_no_bytes_break_the_reader_or_the_matching(data: bytes):
     reader = LineReader()
     for line in reader.feed(data + b"\r"):
         try:
-            match_reply(pmd_protocol.read(1, "E"), line)
+            reply = match_reply(pmd_protocol.read(1, "E"), line)
         except PmdError:
             continue
+        assert (reply is not None) == line.startswith("X1E:")
+    assert reader.feed(b"X1E:7\r") == ["X1E:7"]
 
 
 def test_an_endless_line_is_dropped_and_counted():

@@ -11,7 +11,8 @@ from pathlib import Path
 
 from axis_model import AXES, ModelMotors, Stage
 
-from robot_bridge.bridge import Bridge, BridgeSettings
+from robot_bridge.bridge import Bridge
+from robot_bridge.bridge_settings import BridgeSettings
 from robot_bridge.client import BridgeClient
 from robot_bridge.framing import Deframer, FrameCounters, StopFrame
 from robot_bridge.journal import FILE_NAME, CommandRecord, Journal

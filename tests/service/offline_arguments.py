@@ -4,7 +4,12 @@ import numpy as np
 
 from service.approach import ApproachArguments
 from service.calibration import Calibration, CalibrationArguments
+from service.sensing import ValidationGate
 from sr_engine.shiftset import named
+
+GATE = ValidationGate(
+    position_gate_mm=3.0, gate_sigma=5.0, repeatability_mm=0.014, scale_error=0.015
+)
 
 
 def calibration_arguments(**changes) -> CalibrationArguments:
@@ -13,10 +18,7 @@ def calibration_arguments(**changes) -> CalibrationArguments:
         "origin_um": {"xt": 0, "yt": 0},
         "move_um": 15_000,
         "shifts_px": named("single").shifts_px,
-        "position_gate_mm": 3.0,
-        "gate_sigma": 5.0,
-        "repeatability_mm": 0.014,
-        "scale_error": 0.015,
+        "gate": GATE,
     }
     return CalibrationArguments(**{**values, **changes})
 
@@ -29,10 +31,7 @@ def approach_arguments(target_mm, **changes) -> ApproachArguments:
         "confidence": 0.95,
         "max_iterations": 8,
         "confirm_moves": True,
-        "position_gate_mm": 3.0,
-        "gate_sigma": 5.0,
-        "repeatability_mm": 0.014,
-        "scale_error": 0.015,
+        "gate": GATE,
     }
     return ApproachArguments(**{**values, **changes})
 

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from offline_arguments import approach_arguments, beside, calibration_arguments
 
-from service.approach import CONFIRM, REJECT, approach, frames_that_decide
+from service.approach import SteeredFiducial, approach
 from service.calibration import calibrate
 from service.estimate import FiducialEstimate
 from service.sensing import ProcedureFailedError
-from service.steps import AskOperator, Measured, MoveTo
+from service.steering import CONFIRM, REJECT
+from service.steps import AskOperator, MoveTo
 from simulator.config import Placement, StaticObject, VirtualRoom
 from simulator.stage_physics import StageParameters
 from studies.offline_room import MrImaging, OfflineRoom
@@ -178,12 +179,11 @@ def test_h11_when_only_the_other_object_is_left_nothing_is_believed(calibrated):
 
 
 def test_more_slices_only_where_they_decide():
-    arguments = approach_arguments((0.0, 0.0))
-    seen = Measured(1, frames=1)
+    fiducial = SteeredFiducial(approach_arguments((0.0, 0.0)))
 
     def wanted(error_mm, sigma_mm):
         estimate = FiducialEstimate({}, np.array([error_mm, 0.0]), np.eye(2) * sigma_mm**2)
-        return frames_that_decide(arguments, estimate, seen)
+        return fiducial.frames_wanted(estimate, 1)
 
     assert wanted(0.0, 0.01) == 1
     assert wanted(0.0, 0.03) == 2

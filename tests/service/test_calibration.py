@@ -4,11 +4,10 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from offline_arguments import calibration_arguments
+from offline_arguments import GATE, calibration_arguments
 
 from service.calibration import calibrate
-from service.estimate import MotionNoise
-from service.looking import STRATEGIES, LookArguments, look_at_fiducial
+from service.looking import STRATEGIES, look_at_fiducial
 from service.sensing import ProcedureFailedError, move
 from service.steps import MoveTo
 from simulator.config import Fiducial, StaticObject, VirtualRoom
@@ -102,18 +101,17 @@ def test_two_equal_round_objects_are_refused_not_guessed():
 def test_the_native_jacobian_scaled_is_the_one_of_super_resolution_images(calibrated):
     """As the paper says: repeating the procedure with SR images (0.5 mm pixels) gives the same."""
     room, calibration = calibrated
-    looking = LookArguments(3.0, 5.0, MotionNoise(0.014, 0.015), seed=1)
 
     def seen_with_sr(setpoints_um, number):
         moved = yield from move(MoveTo(setpoints_um, "calibration"))
         estimate = calibration.estimate.moved_to(
-            moved.readback_um, calibration.jacobian, looking.noise
+            moved.readback_um, calibration.jacobian, GATE.noise
         )
         look = yield from look_at_fiducial(
             STRATEGIES["sr"].fine,
             replace(calibration, estimate=estimate),
-            looking,
-            number=number,
+            GATE,
+            seed=(1, number),
             fresh=True,
         )
         return look.found.plane_mm / 0.5  # in pixels of the SR image

@@ -5,9 +5,9 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from offline_arguments import GATE
 
 from case_record.record import CaseRecord
-from service.approach import REJECT
 from service.calibration import Calibration
 from service.guide_approach import GuideApproachArguments, approach_guide
 from service.guide_calibration import GuideCalibrationArguments, calibrate_guide
@@ -27,6 +27,7 @@ from service.procedures import (
 )
 from service.replay import replay_measurements, replay_procedure
 from service.sensing import ProcedureFailedError
+from service.steering import REJECT
 from service.targets import needle_line
 from simulator.config import Fiducial, VirtualRoom
 from simulator.mr_slice import slice_geometry
@@ -47,13 +48,6 @@ ROOM = VirtualRoom(
 GEOMETRY = GuideGeometry(UPPER, LOWER, APART, (58.0 - APART + UPPER, 58.0 - APART + LOWER), BELOW)
 PLANE = plane_of(slice_geometry(ROOM.protocol))
 
-
-GATES = {
-    "position_gate_mm": 3.0,
-    "gate_sigma": 5.0,
-    "repeatability_mm": 0.014,
-    "scale_error": 0.015,
-}
 LOWER_PLANE = 58.0 - APART
 
 
@@ -63,8 +57,9 @@ def calibration_arguments(**changes):
         "origin_um": dict.fromkeys(AXES, 0),
         "move_um": 6000,
         "geometry": GEOMETRY,
+        "gate": GATE,
     }
-    return GuideCalibrationArguments(**{**values, **GATES, **changes})
+    return GuideCalibrationArguments(**{**values, **changes})
 
 
 def approach_arguments(target_mm, **changes):
@@ -77,8 +72,9 @@ def approach_arguments(target_mm, **changes):
         "confidence": 0.95,
         "max_iterations": 8,
         "confirm_moves": True,
+        "gate": GATE,
     }
-    return GuideApproachArguments(**{**values, **GATES, **changes})
+    return GuideApproachArguments(**{**values, **changes})
 
 
 def make_room(seed, room=ROOM, **options):
@@ -292,7 +288,7 @@ def test_a_recorded_line_is_where_the_guide_truly_points_as_well_as_it_says():
     for seed in range(12):
         room = make_room(seed)
         calibration = room.run(calibrate_guide(calibration_arguments()))
-        recording = GuideRecordingArguments(GEOMETRY, LOWER_PLANE, 0.05, **GATES)
+        recording = GuideRecordingArguments(GEOMETRY, LOWER_PLANE, 0.05, GATE)
         place = room.run(record_guide(recording, calibration))
         assert place.sigma_mm < 0.05
         assert place.tip_below_joint_mm == BELOW

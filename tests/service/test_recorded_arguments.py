@@ -1,0 +1,69 @@
+"""Arguments of procedures as they stand in the record: cases of earlier versions stay readable."""
+
+import json
+from dataclasses import fields
+
+import numpy as np
+import pytest
+from offline_arguments import approach_arguments, calibration_arguments
+from test_guide import PLANE
+from test_guide import approach_arguments as guide_approach
+from test_guide import calibration_arguments as guide_calibration
+
+from case_record.rows import Procedure
+from service.calibration import Calibration
+from service.estimate import FiducialEstimate
+from service.jacobian import ImageJacobian
+from service.procedures import (
+    APPROACH,
+    CALIBRATION,
+    GUIDE_APPROACH,
+    GUIDE_CALIBRATION,
+    build_procedure,
+)
+from service.procedures import approach_arguments as recorded_approach
+from service.procedures import calibration_arguments as recorded_calibration
+from service.procedures import guide_approach_arguments as recorded_guide_approach
+from service.procedures import guide_calibration_arguments as recorded_guide_calibration
+from service.steps import Acquire, MoveTo
+
+
+def start(axes):
+    """As badly known as can be: an approach from here looks before it moves."""
+    n = len(axes)
+    estimate = FiducialEstimate(dict.fromkeys(axes, 0), np.zeros(n), np.eye(n))
+    return Calibration(ImageJacobian.unknown(axes), estimate, PLANE, 1)
+
+
+GATE = {"position_gate_mm": 3.0, "gate_sigma": 5.0, "repeatability_mm": 0.014, "scale_error": 0.015}
+CALIBRATED = {"axes", "origin_um", "move_um"}
+APPROACHED = {"target_mm", "travel_um", "tolerance_mm", "confidence", "max_iterations"}
+RECORDED = {
+    CALIBRATION: recorded_calibration(calibration_arguments()),
+    APPROACH: recorded_approach(approach_arguments((1.0, 2.0)), start(("xt", "yt"))),
+    GUIDE_CALIBRATION: recorded_guide_calibration(guide_calibration()),
+    GUIDE_APPROACH: recorded_guide_approach(
+        guide_approach(np.zeros(4)), start(("xt", "yt", "xb", "yb"))
+    ),
+}
+OTHERS = {
+    CALIBRATION: CALIBRATED | {"shifts_px", "method"},
+    APPROACH: APPROACHED | {"confirm_moves", "strategy", "stop_rule", "seed"},
+    GUIDE_CALIBRATION: CALIBRATED | {"geometry"},
+    GUIDE_APPROACH: APPROACHED | {"confirm_moves", "geometry", "lower_plane_mm"},
+}
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_the_numbers_of_the_gate_stand_among_the_other_arguments(name):
+    recorded = RECORDED[name].get("arguments", RECORDED[name])
+    assert set(recorded) == set(GATE) | OTHERS[name]
+    assert {key: recorded[key] for key in GATE} == GATE
+
+
+@pytest.mark.parametrize("name", RECORDED)
+def test_a_recorded_procedure_can_be_begun_again(name):
+    values = {field.name: None for field in fields(Procedure)}
+    row = Procedure(**{**values, "name": name, "arguments": json.loads(json.dumps(RECORDED[name]))})
+    first = next(build_procedure(row))
+    assert isinstance(first, MoveTo if "axes" in row.arguments else Acquire)
