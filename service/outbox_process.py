@@ -144,4 +144,7 @@ def _first_line() -> bytes:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    code = main()
+    sys.stderr.flush()
+    # at once: pynetdicom's threads may wait for a destination that keeps silent
+    os._exit(code)

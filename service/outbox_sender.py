@@ -82,27 +82,29 @@ class Sender:
                     self._stopping.wait(_LOOK_S)
 
     def _due(self, store: OutboxStore) -> list[Delivery]:
+        """What was tried least goes first: one that breaks every association stops no other."""
         waiting = store.open_deliveries(self._destination.name)
-        due = [
-            one for one in waiting if one.name not in self._each or self._each[one.name].is_due()
-        ]
-        return due[:_MOST_AT_ONCE]
+        due = [one for one in waiting if self._may_go(one.name)]
+        return sorted(due, key=lambda one: one.attempts)[:_MOST_AT_ONCE]
+
+    def _may_go(self, name: str) -> bool:
+        return name not in self._each or self._each[name].is_due()
 
     def _send(self, store: OutboxStore, record: CaseRecord, due: list[Delivery]) -> None:
         before = {one.name: one for one in due}
         files = [(one.name, output_of(one.name).path(self._case_dir)) for one in due]
-        last = Outcome.STORED
+        outcomes = set()
         try:
             for attempt in send(self._destination, self._config.timeout_s, files):
                 self._note(store, record, before[attempt.name], attempt)
-                last = attempt.outcome
+                outcomes.add(attempt.outcome)
                 if self._stopping.is_set():
                     return
         except UnreachableError as error:
             self._line_failed(store, str(error))
             return
-        # who gives no answer, or has no room, is left in peace for a while
-        if last is Outcome.LATER:
+        # who only gives no answer, or has no room, is left in peace for a while
+        if outcomes == {Outcome.LATER}:
             self._line.failed()
         else:
             self._line.succeeded()

@@ -22,7 +22,7 @@ from service.outputs import FOLDER, Kind, Output
 from service.parameters import Id
 from service.problems import ProblemError, responses
 
-_PATIENCE_S = 60.0
+_PATIENCE_S = 180.0
 _TURN_S = 20.0
 _DICOM: dict[int | str, dict[str, Any]] = {
     **responses(401, 404, 409, 422, 429, 503),

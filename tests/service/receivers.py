@@ -47,11 +47,14 @@ class Receiver:
         self.received: list[tuple[str, bytes]] = []
         self.answer: Callable[[int], int | Dataset] = lambda number: 0x0000
         self.port = 0
+        self.breaks_on: str | None = None
 
     def store(self, event: Any) -> int | Dataset:
         number = len(self.received)
         encoded = event.encoded_dataset(include_meta=False)
         self.received.append((str(event.request.AffectedSOPInstanceUID), encoded))
+        if self.uids[number] == self.breaks_on:
+            event.assoc.dul.socket.close()  # as a receiver that crashes over it
         return self.answer(number)
 
     def again(self, number: int) -> bool:
@@ -116,10 +119,10 @@ def free_port() -> int:
         return int(sock.getsockname()[1])
 
 
-def wait_until(condition: Callable[[], object], timeout_s: float = 60.0) -> None:
+def wait_until(condition: Callable[[], object], timeout_s: float = 150.0) -> None:
     deadline_s = time.monotonic() + timeout_s
     while not condition():
-        assert time.monotonic() < deadline_s, "not so within a minute"
+        assert time.monotonic() < deadline_s, f"not so within {timeout_s:.0f} s"
         time.sleep(0.02)
 
 

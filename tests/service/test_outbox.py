@@ -33,7 +33,7 @@ from recorded_case import add_measurement, come_to_ready, make_case, puncture
 from case_record.record import CaseRecord
 from room_config.load import ConfigError, load_config
 from service.outbox_store import OutboxStore
-from service.outputs import FOLDER, outputs_to_send
+from service.outputs import FOLDER, make_output, outputs_to_send
 
 DESTINATION = """
 [[outputs.destination]]
@@ -205,6 +205,16 @@ def test_a_destination_that_keeps_silent_does_not_hold_up_another_one(case_dir, 
         with running_outbox(config):
             wait_until(lambda: silent.received)
             wait_until_sent(case_dir)
+
+
+def test_an_object_at_which_the_receiver_breaks_off_holds_up_no_other(case_dir, archive):
+    with CaseRecord(case_dir) as record:
+        path = make_output(record, next(outputs_to_send(record)))
+    archive.breaks_on = pydicom.dcmread(path).SOPInstanceUID
+    with running_outbox(room(case_dir, {"name": "archive", "port": archive.port})):
+        wait_until(lambda: sorted(states(case_dir).values()) == ["sent"] * 4 + ["waiting"])
+        archive.breaks_on = None
+        wait_until_sent(case_dir)
 
 
 def test_a_destination_that_comes_back_gets_everything(case_dir):
@@ -408,7 +418,7 @@ def test_the_outbox_ends_with_the_service(case_dir, archive, log):
 )
 def test_outputs_are_had_from_the_api(shown: tuple[str, Path], path, sop_class):
     url, folder = shown
-    answer = httpx.get(f"{url}/api/v1/{path}")
+    answer = httpx.get(f"{url}/api/v1/{path}", timeout=200.0)
     assert answer.status_code == 200, answer.text
     assert answer.headers["content-type"] == "application/dicom"
     file = folder / "got.dcm"
