@@ -1,6 +1,7 @@
 """`autospine export CASE`: a case as one zip of DICOM files, JSON lines and images.
 
-Files are as they were received, byte for byte; MANIFEST.json names every member with its SHA-256.
+Slices are as they were received, byte for byte, outputs as they were made; MANIFEST.json names
+every member with its SHA-256.
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import typer
 
 from case_record.record import CaseRecord
 from service.images import ImageMissingError, Rendering, png_of, reconstruction_pixels, slice_pixels
+from service.outputs import FOLDER as OUTPUTS
 
 app = typer.Typer(add_completion=False)
 FORMAT = "autospine-case-export"
@@ -111,6 +113,8 @@ def _members(record: CaseRecord, missing: list[str]) -> Iterator[tuple[str, byte
             missing.append(row.path)
             continue
         yield f"dicom/{Path(row.path).name}", path.read_bytes()
+    for path in sorted((record.case_dir / OUTPUTS).glob("*.dcm")):
+        yield f"outputs/{path.name}", path.read_bytes()
     yield from _images(record)
 
 

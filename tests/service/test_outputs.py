@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -16,6 +17,7 @@ from receivers import needs_program
 from recorded_case import OFFSET_MM, TOLERANCE_MM, come_to_ready, make_case, puncture
 
 from case_record.record import CaseRecord, CaseRecordError
+from service.export import write_export
 from service.finding import finding_of_arrival, finding_of_measurement
 from service.output_codes import CENTRE, CENTRE_ALONG, DEPTH, DISTANCE, PROBABILITY, TOLERANCE
 from service.outputs import Output, OutputError, dataset_of, make_output, output_of, outputs_to_send
@@ -304,3 +306,11 @@ def violations(dataset: Dataset) -> list[str]:
     finally:
         sys.path.pop(0)
     return dicom_standard.violations(dataset)
+
+
+def test_an_export_takes_what_was_made_along(record: CaseRecord, tmp_path: Path) -> None:
+    path = make_output(record, READY_REPORT)
+    record.start_case("test", 1)
+    write_export(record, tmp_path / "case.zip")
+    with zipfile.ZipFile(tmp_path / "case.zip") as archive:
+        assert archive.read(f"outputs/{path.name}") == path.read_bytes()
