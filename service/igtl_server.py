@@ -12,6 +12,7 @@ import asyncio
 import contextlib
 import ipaddress
 import socket
+import sqlite3
 from pathlib import Path
 
 import structlog
@@ -88,8 +89,10 @@ class OpenIgtLinkServer:
                 continue
             revision, told_s = state.revision, now_s()
             scene = scene_of(state)
-            with contextlib.suppress(CaseRecordError):  # shown without images until it is there
+            try:
                 scene |= await asyncio.to_thread(self._images_of_state)
+            except (CaseRecordError, sqlite3.Error, OSError, ValueError) as error:
+                log.warning("scene without images", reason=str(error))
             async with self._changed:
                 self._scene = scene
                 self._changed.notify_all()
