@@ -32,7 +32,7 @@ from service.access import new_token, token_hash
 from service.client import RoomClient
 
 PATIENCE_S = 300.0
-_FEW, _MANY, _SLOW_ONES = 12, 150, 3
+_FEW, _MANY, _SLOW_ONES = 8, 150, 3
 _NEGATIVE = schemathesis.GenerationMode.NEGATIVE
 _CHECKS = [
     not_a_server_error,
