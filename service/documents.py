@@ -1,18 +1,14 @@
-"""Report and export of a case, each made by its own command in a process of its own.
-
-Packing a case takes seconds of processor time; in the service's process it would compete with the
-control loop for the interpreter.
-"""
+"""Report and export of a case, each made by its own command: packing a case takes seconds."""
 
 from __future__ import annotations
 
 import shutil
-import subprocess
 import tempfile
 import threading
 from pathlib import Path
 
 from service.children import autospine
+from service.elsewhere import run_elsewhere
 from service.problems import ProblemError
 
 _PATIENCE_S = 600.0
@@ -47,20 +43,9 @@ class Documents:
 
 def _written(command: str, case_dir: Path, target: Path) -> Path:
     words = autospine(command, str(case_dir), "--out", str(target))
-    nice = shutil.which("nice")
-    try:
-        done = subprocess.run(
-            [*([nice] if nice else []), *words],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=_PATIENCE_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        text = f"The {command} was not made within {_PATIENCE_S:.0f} s."
-        raise ProblemError(503, "no_answer", text) from None
-    if done.returncode != 0 or not target.is_file():
-        last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
-        raise ProblemError(409, f"no_{command}", last.removeprefix(_FAILED))
+    failure = run_elsewhere(words, f"The {command}", _PATIENCE_S)
+    if failure is None and not target.is_file():
+        failure = "it said nothing"
+    if failure is not None:
+        raise ProblemError(409, f"no_{command}", failure.removeprefix(_FAILED))
     return target

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 import sys
 import threading
 from pathlib import Path
@@ -15,6 +13,7 @@ from pydantic import BaseModel
 
 from case_record.record import CaseRecord
 from room_config.load import Config
+from service.elsewhere import run_elsewhere
 from service.finding import finding_of_arrival, finding_of_measurement, finding_of_puncture
 from service.images import ImageMissingError
 from service.outbox_store import FILE_NAME, STATES, OutboxStore, State
@@ -180,21 +179,8 @@ class _Desk:
 
 
 def _made_elsewhere(case_dir: Path, output: Output) -> None:
-    """In a process of its own: highdicom and the images would keep the control loop waiting."""
-    nice = shutil.which("nice")
+    """highdicom takes its time to load."""
     words = [sys.executable, "-m", "service.outputs", str(case_dir), output.name]
-    try:
-        done = subprocess.run(
-            [*([nice] if nice else []), *words],
-            stdin=subprocess.DEVNULL,
-            capture_output=True,
-            text=True,
-            timeout=_PATIENCE_S,
-            check=False,
-        )
-    except subprocess.TimeoutExpired:
-        text = f"{output.name} was not made within {_PATIENCE_S:.0f} s."
-        raise ProblemError(503, "no_answer", text) from None
-    if done.returncode != 0:
-        last = (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
-        raise ProblemError(409, "no_output", f"{output.name} cannot be made: {last}")
+    failure = run_elsewhere(words, output.name, _PATIENCE_S)
+    if failure is not None:
+        raise ProblemError(409, "no_output", f"{output.name} cannot be made: {failure}")
