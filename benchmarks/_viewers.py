@@ -2,7 +2,7 @@
 
     python benchmarks/_viewers.py http://127.0.0.1:PORT COUNT
 
-obeys the words `in` and `out` on standard input.
+obeys the words `in ID` (from that event on, as a page does) and `out` on standard input.
 """
 
 import asyncio
@@ -28,7 +28,7 @@ class Viewers:
     count: int
 
     def come_in(self) -> None:
-        self._tell("in", self.count)
+        self._tell(f"in {self.client.state().event_id}", self.count)
 
     def leave(self) -> None:
         self._tell("out", 0)
@@ -56,23 +56,24 @@ def viewers(client: RoomClient, count: int) -> Iterator[Viewers]:
 
 
 async def view(url: str, count: int) -> None:
-    """Obey the words `in` and `out` on standard input."""
+    """Obey the words `in ID` and `out` on standard input."""
     host, port = url.removeprefix("http://").split(":")
     readers: list[asyncio.Task[None]] = []
     while word := (await asyncio.to_thread(sys.stdin.readline)).strip():
-        if word == "in" and not readers:
-            readers = [asyncio.create_task(_read(host, int(port))) for _ in range(count)]
+        if word.startswith("in ") and not readers:
+            after = int(word.removeprefix("in "))
+            readers = [asyncio.create_task(_read(host, int(port), after)) for _ in range(count)]
         elif word == "out":
             for reader in readers:
                 reader.cancel()
             readers = []
 
 
-async def _read(host: str, port: int) -> None:
+async def _read(host: str, port: int, after: int) -> None:
     reader, writer = await asyncio.open_connection(host, port)
     try:
-        words = f"GET /api/v1/events/live HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n"
-        writer.write(words.encode())
+        path = f"/api/v1/events/live?after={after}"
+        writer.write(f"GET {path} HTTP/1.1\r\nHost: {host}:{port}\r\n\r\n".encode())
         while await reader.read(65536):
             pass
     finally:

@@ -27,7 +27,7 @@ _LEAST_BETWEEN_STATES_S = 0.04
 _BEAT_S = 1.0
 _AGAIN_S = 1.0
 _KEPT_EVENTS = 1000
-_EVENTS_AT_ONCE = 500
+_EVENTS_AT_ONCE = 100
 
 
 class Broadcast:
@@ -45,6 +45,7 @@ class Broadcast:
         self._events: deque[tuple[int, bytes]] = deque(maxlen=_KEPT_EVENTS)
         self._newest_id = 0
         self._turn = asyncio.Event()
+        self._looking_back = asyncio.Lock()
         self.viewers = 0
 
     def start(self) -> None:
@@ -117,15 +118,21 @@ class Broadcast:
         """Yield messages for one viewer: what it missed since an event id, and what comes."""
         self.viewers += 1
         try:
-            text, after_id = await asyncio.to_thread(self._missed, after_id)
-            yield b"retry: 500\n\n" + text + _state_message(self._loop.state.model_dump_json())
+            yield b"retry: 500\n\n"
+            reached_id = after_id
+            async for text, newest_id in self._missed(after_id):
+                reached_id = newest_id
+                yield text
+            text, reached_id = self._kept_since(reached_id)
+            yield text + _state_message(self._loop.state.model_dump_json())
             shown, beaten = self._state_message, self._beat_message
             while True:
                 turn = self._turn
-                if self._events and after_id + 1 < self._events[0][0]:  # a viewer that dawdles
-                    text, after_id = await asyncio.to_thread(self._missed, after_id)
-                else:
-                    text, after_id = self._kept_since(after_id)
+                if self._events and not self._keeps_all_since(reached_id):  # it dawdles
+                    async for text, newest_id in self._missed(reached_id):
+                        reached_id = newest_id
+                        yield text
+                text, reached_id = self._kept_since(reached_id)
                 if shown is not self._state_message:
                     shown = self._state_message
                     text += shown
@@ -149,16 +156,31 @@ class Broadcast:
             new.append(message)
         return b"".join(reversed(new)), self._events[-1][0]
 
-    def _missed(self, after_id: int) -> tuple[bytes, int]:
-        """Everything in the record after an event id, for a viewer that comes (back)."""
+    def _keeps_all_since(self, after_id: int) -> bool:
+        return bool(self._events) and after_id + 1 >= self._events[0][0]
+
+    async def _missed(self, after_id: int) -> AsyncIterator[tuple[bytes, int]]:
+        """What is not kept any more of the events after an id, and the id that it goes up to.
+
+        One viewer at a time and a little at a time: where many come at once and want all of a long
+        case, the control loop must still get at the interpreter.
+        """
+        while not self._keeps_all_since(after_id):
+            async with self._looking_back:
+                text, newest_id = await asyncio.to_thread(self._recorded, after_id)
+            if newest_id == after_id:
+                return
+            after_id = newest_id
+            yield text, after_id
+
+    def _recorded(self, after_id: int) -> tuple[bytes, int]:
         if not self._loop.state.case_uid:
             return b"", after_id
-        text: list[bytes] = []
         with CaseRecord(self._case_dir) as record:
-            while events := record.events(after_id, _EVENTS_AT_ONCE):
-                text += map(_event_message, events)
-                after_id = events[-1].event_id
-        return b"".join(text), after_id
+            events = record.events(after_id, _EVENTS_AT_ONCE)
+        if not events:
+            return b"", after_id
+        return b"".join(map(_event_message, events)), events[-1].event_id
 
 
 def _state_message(text: str) -> bytes:
