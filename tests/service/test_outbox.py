@@ -205,6 +205,7 @@ def test_a_destination_that_keeps_silent_does_not_hold_up_another_one(case_dir, 
         with running_outbox(config):
             wait_until(lambda: silent.received)
             wait_until_sent(case_dir)
+        assert len(set(archive.uids)) == len(states(case_dir))
 
 
 def test_an_object_at_which_the_receiver_breaks_off_holds_up_no_other(case_dir, archive):
@@ -215,6 +216,7 @@ def test_an_object_at_which_the_receiver_breaks_off_holds_up_no_other(case_dir, 
         wait_until(lambda: sorted(states(case_dir).values()) == ["sent"] * 4 + ["waiting"])
         archive.breaks_on = None
         wait_until_sent(case_dir)
+    assert set(states(case_dir).values()) == {"sent"}
 
 
 def test_a_destination_that_comes_back_gets_everything(case_dir):
