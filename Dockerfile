@@ -12,6 +12,7 @@ RUN pip install --no-cache-dir --require-hashes -r requirements.lock
 COPY pyproject.toml README.md LICENSE ./
 COPY service ./service
 COPY dicom_listener ./dicom_listener
+COPY dicom_slice ./dicom_slice
 COPY sr_engine ./sr_engine
 COPY robot_bridge ./robot_bridge
 COPY case_record ./case_record

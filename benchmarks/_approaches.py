@@ -13,7 +13,7 @@ from typing import Any
 from case_record.record import CaseRecord
 from case_record.rows import Measurement
 from service.client import RoomClient
-from service.state import RoomState
+from service.room.state import RoomState
 from simulator.demo_room import DemoRoom
 
 _TARGETS_MM = ((0.6, 0.0, 0.5), (-0.4, 0.0, -0.6), (0.2, 0.0, 0.7), (-0.7, 0.0, 0.3))

@@ -33,8 +33,8 @@ from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 from pynetdicom import AE
 
 from case_record.record import CaseRecord, CaseRecordError
-from dicom_listener.quirks import MR_IMAGE
 from dicom_listener.requestor import mended
+from dicom_slice.quirks import MR_IMAGE
 
 ROOT = Path(__file__).parents[1]
 TITLE = "AUTOSPINE"

@@ -24,9 +24,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "robot_bridge"))
 from bridge_room import AXES, BridgeRoom, bridge_room
 from campaign import Campaign
 
-from robot_bridge.client import BridgeClient, LinkLostError, RefusedError
-from robot_bridge.messages import Code, CommandState
-from robot_bridge.phases import WorkPhase
+from robot_bridge.client.client import BridgeClient, LinkLostError, RefusedError
+from robot_bridge.protocol.messages import Code, CommandState
+from robot_bridge.protocol.phases import WorkPhase
 from simulator.serial_line import LineFaults
 
 LOSSY = LineFaults(loss=0.2)

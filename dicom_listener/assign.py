@@ -23,9 +23,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from dicom_listener.clock import OffsetBounds
-from dicom_listener.header import Slice
-from dicom_listener.reasons import Reason
-from sr_engine.geometry import SliceGeometry
+from dicom_slice.geometry import SliceGeometry
+from dicom_slice.header import Slice
+from dicom_slice.reasons import Reason
 
 ARRIVAL = "arrival"
 _MAY_BE_MISSING = (Reason.AFTER_INCOMPLETE_HOLD, Reason.RECEIVED_AFTER_HOLD)

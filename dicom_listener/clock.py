@@ -11,7 +11,7 @@ too small makes acquisitions look earlier than they were, and those are refused,
 
 from dataclasses import dataclass, replace
 
-from dicom_listener.times import AcquisitionInterval
+from dicom_slice.times import AcquisitionInterval
 
 _DRIFT_SLICES = 10
 

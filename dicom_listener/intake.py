@@ -27,11 +27,8 @@ from dicom_listener.assign import (
     assign,
 )
 from dicom_listener.clock import ClockRules, Sync
-from dicom_listener.decode_guard import DecodeGuard
-from dicom_listener.header import Slice, read_header
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope
 from dicom_listener.metrics import ListenerMetrics
-from dicom_listener.reasons import Reason, SetAside, UnusableError
 from dicom_listener.scanner_clocks import ScannerClocks
 from dicom_listener.slice_rows import (
     outcome_of,
@@ -39,8 +36,11 @@ from dicom_listener.slice_rows import (
     row_without_header,
     slice_from_record,
 )
-from dicom_listener.times import TimeFrame
-from dicom_listener.usable import SliceRules, why_not_usable
+from dicom_slice.decode_guard import DecodeGuard
+from dicom_slice.header import Slice, read_header
+from dicom_slice.reasons import Reason, SetAside, UnusableError
+from dicom_slice.times import TimeFrame
+from dicom_slice.usable import SliceRules, why_not_usable
 
 SOURCE = "listener"
 _HOLDS_LOOKED_AT = 64

@@ -15,7 +15,7 @@ from pynetdicom import AE, AllStoragePresentationContexts
 from pynetdicom.association import Association
 from pynetdicom.presentation import PresentationContext
 
-from dicom_listener.quirks import MR_CLASSES
+from dicom_slice.quirks import MR_CLASSES
 
 VERIFICATION = "1.2.840.10008.1.1"
 _UNCOMPRESSED = (

@@ -21,7 +21,7 @@ from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.retention import remove_old
 from dicom_listener.scp import Scp, ScpRules, tls_context
-from dicom_listener.usable import SliceRules
+from dicom_slice.usable import SliceRules
 from room_config.listener import ListenerConfig
 from room_config.load import Config, ConfigError
 

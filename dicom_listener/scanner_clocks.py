@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Any
 
 from dicom_listener.clock import ClockRules, Drift, OffsetBounds, ScannerClock, Sync, observe
-from dicom_listener.header import Slice
+from dicom_slice.header import Slice
 
 
 class ScannerClocks:

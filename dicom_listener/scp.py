@@ -24,8 +24,8 @@ from dicom_listener import inbox as inbox_module
 from dicom_listener.inbox import Envelope, Inbox, InboxError, sha256_of
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.negotiation import NegotiationReport, add_contexts, rejection_text, report_of
-from dicom_listener.peek import NoDataSetError, peek
 from dicom_listener.transport import BoundedSocket, PromptServer
+from dicom_slice.peek import NoDataSetError, peek
 
 SUCCESS = 0x0000
 OUT_OF_RESOURCES = 0xA700

@@ -6,12 +6,12 @@ from typing import Any
 
 from case_record.rows import NewSlice
 from dicom_listener.assign import ARRIVAL, Assigned, Decision, Pending
-from dicom_listener.header import Rescale, Slice
 from dicom_listener.inbox import Envelope
-from dicom_listener.quirks import Kind
-from dicom_listener.reasons import SetAside
-from dicom_listener.times import AcquisitionInterval
-from sr_engine.geometry import SliceGeometry
+from dicom_slice.geometry import SliceGeometry
+from dicom_slice.header import Rescale, Slice
+from dicom_slice.quirks import Kind
+from dicom_slice.reasons import SetAside
+from dicom_slice.times import AcquisitionInterval
 
 
 def header_for_record(slice_: Slice) -> dict[str, Any]:

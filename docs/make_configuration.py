@@ -29,7 +29,7 @@ This page is written by `python docs/make_configuration.py` from the models them
 _BRIDGE = """
 ## `[bridge]` and `[[bridge.axis]]`
 
-Read by the daemon in the scanner room (`robot_bridge/config.py`), which has few packages and checks
+Read by the daemon in the scanner room (`robot_bridge/daemon/config.py`), which has few packages and checks
 the table by itself. Travel limits have no default on purpose.
 
 | key | default | meaning |

@@ -9,11 +9,11 @@ import sys
 from collections.abc import Sequence
 from pathlib import Path
 
-from robot_bridge.config import BridgeConfig, ConfigError, load_bridge_config
-from robot_bridge.daemon import JsonLines, StartError, run_bridge
-from robot_bridge.guardian import Guardian, StopOrder
-from robot_bridge.pmd401 import PmdMotors
-from robot_bridge.pmd_protocol import emergency_stop_bytes
+from robot_bridge.daemon.config import BridgeConfig, ConfigError, load_bridge_config
+from robot_bridge.daemon.guardian import Guardian, StopOrder
+from robot_bridge.daemon.main import JsonLines, StartError, run_bridge
+from robot_bridge.pmd.driver import PmdMotors
+from robot_bridge.pmd.protocol import emergency_stop_bytes
 
 EXIT_DONE, EXIT_BAD_INPUT, EXIT_COULD_NOT = 0, 2, 3
 

@@ -53,3 +53,8 @@ def on_parent_gone(end: Callable[[], object]) -> None:
         end()
 
     threading.Thread(target=wait, name="parent", daemon=True).start()
+
+
+def autospine(*words: str) -> list[str]:
+    """Return the command line of a subcommand in this same environment."""
+    return [sys.executable, "-m", "service.cli.main", *words]

@@ -17,17 +17,15 @@ from typing import Any, Literal, TypeVar
 import httpx
 from pydantic import BaseModel, TypeAdapter, ValidationError
 
-from service.bodies import (
-    CaseSummary,
+from service.room.state import RoomState
+from service.room.summaries import CaseSummary, KnownTarget, MeasurementBody
+from service.web.schemas import (
     EventBody,
     Health,
-    KnownTarget,
-    MeasurementBody,
     SessionBody,
     SliceBody,
     Started,
 )
-from service.state import RoomState
 
 _TIMEOUT_S = 35.0
 _STOP_TIMEOUT_S = 2.0

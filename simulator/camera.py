@@ -12,10 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from skimage.transform import resize
 
+from dicom_slice.geometry import SliceGeometry
 from simulator.config import VirtualRoom
 from simulator.mr_slice import slice_geometry
 from simulator.scene import true_fiducial_mm
-from sr_engine.geometry import SliceGeometry
 from sr_engine.psf import Psf
 from sr_engine.simulate import render_disc
 

@@ -18,7 +18,7 @@ import typer
 from rich.console import Console
 
 from case_record.record import CaseRecord
-from service.children import ChildError, quiet_environment
+from service.cli.children import ChildError, quiet_environment
 from service.client import RoomClient
 from simulator.config import parse_virtual_room
 from simulator.demo_operator import WHO, DemoFailedError, Operator

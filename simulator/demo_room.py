@@ -14,8 +14,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from service.access import new_token, token_hash
-from service.children import ChildError, Family, autospine
+from room_config.shell import autospine
+from service.cli.children import ChildError, Family
+from service.web.access import new_token, token_hash
 from simulator.config import VirtualRoom, parse_virtual_room
 from simulator.faults import FAULTS
 from simulator.truth_client import TruthAddress, TruthError, ask_where

@@ -20,8 +20,8 @@ from pydicom.uid import (
 )
 from pydicom.valuerep import format_number_as_ds
 
+from dicom_slice.geometry import SliceGeometry
 from simulator.config import ScannerSettings, SliceProtocol
-from sr_engine.geometry import SliceGeometry
 
 
 @dataclass(frozen=True)

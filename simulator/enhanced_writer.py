@@ -8,6 +8,7 @@ from pydicom.dataset import Dataset
 from pydicom.sequence import Sequence
 from pydicom.uid import EnhancedMRImageStorage
 
+from dicom_slice.geometry import SliceGeometry
 from simulator.config import ScannerSettings, SliceProtocol
 from simulator.dicom_writer import (
     AcquisitionStamp,
@@ -17,7 +18,6 @@ from simulator.dicom_writer import (
     local_time,
     write_mr_image,
 )
-from sr_engine.geometry import SliceGeometry
 
 # What a classic image says for the whole image and an enhanced one says frame by frame.
 _PER_FRAME = (

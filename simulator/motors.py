@@ -30,10 +30,10 @@ from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from types import FrameType
 
-from robot_bridge.emulator import EmulatorServer, PseudoTerminal
-from robot_bridge.emulator_axis import EmulatedController, Motor
-from robot_bridge.emulator_bus import EmulatedBus
-from robot_bridge.emulator_switches import AxisFaults, LineFaults, Switches
+from robot_bridge.emulator.axis import EmulatedController, Motor
+from robot_bridge.emulator.bus import EmulatedBus
+from robot_bridge.emulator.server import EmulatorServer, PseudoTerminal
+from robot_bridge.emulator.switches import AxisFaults, LineFaults, Switches
 from simulator.line_server import LineServer
 from simulator.motion_truth import COMMANDED, MotionTruth
 from simulator.stage_physics import PiezoLegsStage, StageParameters

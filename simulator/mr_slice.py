@@ -11,10 +11,10 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from dicom_slice.geometry import SliceGeometry
 from simulator import phantom
 from simulator.config import Fiducial, SliceProtocol, StaticObject, VirtualRoom
 from simulator.scene import fiducial_in_robot_mm, patient_from_robot
-from sr_engine.geometry import SliceGeometry
 from sr_engine.psf import Psf
 
 Floats = NDArray[np.float64]

@@ -9,8 +9,8 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from dicom_slice.geometry import SliceGeometry
 from simulator.config import StaticObject
-from sr_engine.geometry import SliceGeometry
 from sr_engine.model import disc_spectrum, sphere_slab_spectrum
 
 Floats = NDArray[np.float64]

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.kinematics import Line
+from service.procedure.kinematics import Line
 from simulator.config import Fiducial, Placement, VirtualRoom
 
 Floats = NDArray[np.float64]

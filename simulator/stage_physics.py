@@ -11,7 +11,7 @@ import math
 import random
 from dataclasses import dataclass
 
-from robot_bridge.pmd_protocol import MICROSTEPS_PER_STEP
+from robot_bridge.pmd.protocol import MICROSTEPS_PER_STEP
 
 SLIP_LOAD = 1.1  # of the stall load: the friction holds a little more than the motor can push
 
@@ -74,7 +74,7 @@ REPEATABILITY_DISTANCE_UM = 100.0
 
 
 class PiezoLegsStage:
-    """A `robot_bridge.emulator_physics.StagePhysics`; `position_um` is the axis's true position."""
+    """A `robot_bridge.emulator.physics.StagePhysics`; `position_um` is the axis's true position."""
 
     def __init__(self, parameters: StageParameters, position_um: float, rng: random.Random) -> None:
         self.parameters = parameters

@@ -6,7 +6,6 @@ orthogonal to all that a frame has of its own. What is left over, frame by frame
 the frames agree with their shifts.
 """
 
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
@@ -31,9 +30,11 @@ from sr_engine.errors import (
     ParameterError,
 )
 from sr_engine.fit import DiscFit, fit_disc
+from sr_engine.localization import Localization
 from sr_engine.match import best_matches, correlate, radius_grid
 from sr_engine.model import DISC, Patch, Shape
 from sr_engine.noise import NoiseKind
+from sr_engine.paper import localize_paper
 from sr_engine.psf import Psf
 from sr_engine.recognise import recognise_psf
 from sr_engine.signal import Pixels
@@ -51,38 +52,6 @@ CONSISTENCY_P = 1e-5  # frames that agree look as bad as this once in 100,000 me
 MODEL_FLOOR_PX = 0.01  # what an imperfect point spread may do to one frame; check only
 FOLDING_MARGIN_PX = 6.0
 LARGEST_PERIOD_PX = 160  # ringing that comes round from farther away is below 1e-4 of the object
-
-
-@dataclass(frozen=True, eq=False)
-class Localization:
-    """Centre of the fiducial in the reference pose, and how well it is known.
-
-    centre_px: (row, col), pixel (0, 0) has its centre at (0.0, 0.0).
-    covariance_px2: (2, 2) of the centre, row and col.
-    radius_px, amplitude, background, snr: means over the frames; amplitude is negative for an
-      object darker than what surrounds it; snr = |amplitude| / noise std per channel.
-    residuals_px: (N, 2), what each frame's centre less its shift differs by from centre_px.
-    chi2_per_dof: of the residuals against their covariances (2N - 2 degrees of freedom); for one
-      frame, of its pixels against the model.
-    """
-
-    centre_px: Array
-    covariance_px2: Array
-    radius_px: float
-    amplitude: float
-    background: float
-    snr: float
-    sigma: float
-    chi2_per_dof: float
-    n_frames: int
-    method: str
-    residuals_px: Array
-    psf: Psf
-
-    @property
-    def sigma_px(self) -> Array:
-        """Standard deviations (row, col)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance_px2)))
 
 
 def localize(
@@ -124,9 +93,6 @@ def localize(
     Raises a subclass of EngineError; never returns a centre that it does not stand for.
     """
     if method in ("base", "bicubic", "sr"):
-        # Loaded here: the paper's methods answer with this module's Localization.
-        from sr_engine.paper import localize_paper
-
         return localize_paper(
             frames, shifts_px, method, start_px=start_px, radius_px=radius_px, gate_px=gate_px,
             saturation_level=saturation_level,

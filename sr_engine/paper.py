@@ -30,7 +30,7 @@ from sr_engine.frames import Region, check_factor, check_frames_and_shifts
 from sr_engine.hough import Circle, HoughSettings, hough_circles
 from sr_engine.ibp import Stopping, estimate_noise_sigma
 from sr_engine.interpolate import enlarge_bicubic, frame_from_fine
-from sr_engine.localize import Localization
+from sr_engine.localization import Localization
 from sr_engine.psf import Psf
 from sr_engine.reconstruct import Reconstruction, reconstruct
 

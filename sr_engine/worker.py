@@ -20,8 +20,9 @@ from numpy.typing import NDArray
 from case_record.presence import Presence
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
-from dicom_listener.pixels import magnitude_pixels
-from dicom_listener.reasons import UnusableError
+from dicom_slice.geometry import SliceGeometry
+from dicom_slice.pixels import magnitude_pixels
+from dicom_slice.reasons import UnusableError
 from room_config.imaging import PointSpreadConfig
 from room_config.load import Config
 from sr_engine.checks import refuse_non_square
@@ -31,9 +32,9 @@ from sr_engine.errors import (
     OutsideGateError,
     SingularShiftSetError,
 )
-from sr_engine.geometry import SliceGeometry
 from sr_engine.hough import HoughSettings
-from sr_engine.localize import SEARCH_PX, Localization, localize
+from sr_engine.localization import Localization
+from sr_engine.localize import SEARCH_PX, localize
 from sr_engine.paper import PaperMethod, PaperSettings, localize_paper
 from sr_engine.psf import Psf
 from sr_engine.recognise import psf_of_noise

@@ -11,12 +11,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.approach import PAPER, PROBABILITY, ApproachArguments, Arrival, approach
-from service.calibration import Calibration, CalibrationArguments, calibrate
-from service.looking import STRATEGIES
-from service.recording import RecordingArguments, record_place
-from service.sensing import ProcedureFailedError, ValidationGate, move
-from service.steps import MoveTo, ProcedureSteps
+from service.procedure.approach import PAPER, PROBABILITY, ApproachArguments, Arrival, approach
+from service.procedure.calibration import Calibration, CalibrationArguments, calibrate
+from service.procedure.recording import RecordingArguments, record_place
+from service.procedure.sensing import ProcedureFailedError, ValidationGate, move
+from service.procedure.steps import MoveTo, ProcedureSteps
+from service.procedure.strategies import STRATEGIES
 from simulator.camera import Camera
 from simulator.config import SliceProtocol, VirtualRoom
 from simulator.stage_physics import StageParameters

@@ -15,12 +15,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from case_record.rows import SliceRow
-from robot_bridge.pmd_protocol import MICROSTEPS_PER_STEP
-from service.measuring import measure_request, measured_from_result
-from service.plan import PLAN_VOID, why_void
-from service.plane import ImagePlane
-from service.sensing import ABORT
-from service.steps import (
+from dicom_slice.geometry import SliceGeometry
+from robot_bridge.pmd.protocol import MICROSTEPS_PER_STEP
+from service.procedure.plan import PLAN_VOID, why_void
+from service.procedure.plane import ImagePlane
+from service.procedure.sensing import ABORT
+from service.procedure.steps import (
     Acquire,
     Acquired,
     Answered,
@@ -33,13 +33,13 @@ from service.steps import (
     ProcedureSteps,
     Step,
 )
+from service.room.measuring import measure_request, measured_from_result
 from simulator.camera import Camera, photograph
 from simulator.config import VirtualRoom
 from simulator.mr_slice import acquire, slice_geometry
 from simulator.scene import true_fiducial_mm
 from simulator.stage_physics import PiezoLegsStage, StageParameters
 from sr_engine.errors import EngineError
-from sr_engine.geometry import SliceGeometry
 from sr_engine.psf import Psf
 from sr_engine.worker import Frames, describe_result, localize_request
 

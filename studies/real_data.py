@@ -17,8 +17,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from dicom_listener.pixels import magnitude_pixels
-from dicom_listener.reasons import UnusableError
+from dicom_slice.pixels import magnitude_pixels
+from dicom_slice.reasons import UnusableError
 from sr_engine.detect import detect
 from sr_engine.errors import EngineError
 from studies.accuracy_report import write_report

@@ -12,13 +12,22 @@ from typing import Any
 
 from case_record.record import CaseRecord
 from case_record.rows import Case, NewSlice
-from dicom_listener.header import read_header
 from dicom_listener.slice_rows import header_for_record
-from robot_bridge.messages import CommandState
-from service.measuring import measure_request, measured_from_result
-from service.procedures import build_procedure, result_to_json
-from service.runner import run_procedure
-from service.steps import Acquire, Acquired, Measure, Measured, Moved, MoveTo, Outcome, Step
+from dicom_slice.header import read_header
+from robot_bridge.protocol.messages import CommandState
+from service.procedure.registry import build_procedure, result_to_json
+from service.procedure.runner import run_procedure
+from service.procedure.steps import (
+    Acquire,
+    Acquired,
+    Measure,
+    Measured,
+    Moved,
+    MoveTo,
+    Outcome,
+    Step,
+)
+from service.room.measuring import measure_request, measured_from_result
 from simulator.config import ScannerSettings
 from simulator.dicom_writer import AcquisitionStamp, Series, Study, write_mr_image
 from simulator.stage_physics import StageParameters

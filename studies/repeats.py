@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from scipy.ndimage import fourier_shift
 from skimage.registration import phase_cross_correlation
 
-from dicom_listener.pixels import magnitude_pixels
-from dicom_listener.reasons import UnusableError
+from dicom_slice.pixels import magnitude_pixels
+from dicom_slice.reasons import UnusableError
 from sr_engine.detect import Candidate, detect
 from sr_engine.errors import EngineError
 from sr_engine.locate import PSF_OBJECTS, likeliest_psf, refine

@@ -1,4 +1,4 @@
-// Where pixels are in the patient (LPS mm), the same convention as sr_engine/geometry.py:
+// Where pixels are in the patient (LPS mm), the same convention as dicom_slice/geometry.py:
 // pixel (0, 0) has its centre at (0, 0); row_direction is where the row index grows.
 
 export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];

@@ -17,10 +17,10 @@ from pydicom.dataset import FileDataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian
 
 from case_record.record import CaseRecord
-from dicom_listener.header import Rescale, Slice
-from dicom_listener.quirks import MR_IMAGE, Kind
-from dicom_listener.times import AcquisitionInterval
-from sr_engine.geometry import SliceGeometry
+from dicom_slice.geometry import SliceGeometry
+from dicom_slice.header import Rescale, Slice
+from dicom_slice.quirks import MR_IMAGE, Kind
+from dicom_slice.times import AcquisitionInterval
 
 SHARED = Path(__file__).parents[2].parent / "shared" / "dicom"
 

@@ -20,8 +20,8 @@ from dicom_listener.assign import (
     assign,
 )
 from dicom_listener.clock import OffsetBounds
-from dicom_listener.reasons import Reason
-from dicom_listener.times import AcquisitionInterval
+from dicom_slice.reasons import Reason
+from dicom_slice.times import AcquisitionInterval
 
 RULES = AssignRules(guard_s=0.1)
 SAME_CLOCK = OffsetBounds(-0.05, 0.05)

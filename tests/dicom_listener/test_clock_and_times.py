@@ -16,10 +16,10 @@ from pydicom.dataset import Dataset
 from pydicom.sequence import Sequence
 
 from dicom_listener.clock import ClockRules, Drift, ScannerClock, Sync, observe
-from dicom_listener.elements import Elements, frame_elements
-from dicom_listener.header import slices_of
 from dicom_listener.scanner_clocks import ScannerClocks
-from dicom_listener.times import (
+from dicom_slice.elements import Elements, frame_elements
+from dicom_slice.header import slices_of
+from dicom_slice.times import (
     AcquisitionInterval,
     ImplausibleTimeError,
     TimeFrame,

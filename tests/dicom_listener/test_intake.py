@@ -17,9 +17,9 @@ from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelo
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.overrule import give_up_slices, reset_clock, sync_clock
-from dicom_listener.quirks import ENHANCED_MR_IMAGE
 from dicom_listener.retention import remove_old
-from dicom_listener.usable import SliceRules
+from dicom_slice.quirks import ENHANCED_MR_IMAGE
+from dicom_slice.usable import SliceRules
 
 
 class Desk:

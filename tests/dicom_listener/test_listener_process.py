@@ -28,14 +28,14 @@ from pynetdicom import AE, evt
 from pynetdicom.association import Association
 
 from case_record.record import CaseRecord
-from dicom_listener.header import read_header
 from dicom_listener.inbox import is_whole, read_envelope
 from dicom_listener.overrule import reassign, reset_clock
-from dicom_listener.pixels import magnitude_pixels
 from dicom_listener.process import run
-from dicom_listener.quirks import MR_IMAGE
 from dicom_listener.requestor import mended
 from dicom_listener.slice_rows import slice_from_record
+from dicom_slice.header import read_header
+from dicom_slice.pixels import magnitude_pixels
+from dicom_slice.quirks import MR_IMAGE
 from room_config.load import ConfigError, load_config
 
 ROOT = Path(__file__).parents[2]

@@ -11,8 +11,8 @@ from pydicom.uid import ExplicitVRLittleEndian
 from pynetdicom import AE
 
 from case_record.record import CaseRecord
-from dicom_listener.quirks import MR_IMAGE
 from dicom_listener.requestor import mended
+from dicom_slice.quirks import MR_IMAGE
 
 
 def resident_kib(pid: int) -> int:

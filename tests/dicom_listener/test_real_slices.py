@@ -11,12 +11,12 @@ import pydicom
 import pytest
 from listener_room import SHARED, needs_shared
 
-from dicom_listener.header import read_header
-from dicom_listener.pixels import check_pixels, magnitude_pixels
-from dicom_listener.quirks import Kind
-from dicom_listener.read import dicom_files, read_frames
-from dicom_listener.reasons import Reason, UnusableError
-from dicom_listener.usable import SliceRules, why_not_usable
+from dicom_slice.header import read_header
+from dicom_slice.pixels import check_pixels, magnitude_pixels
+from dicom_slice.quirks import Kind
+from dicom_slice.read import dicom_files, read_frames
+from dicom_slice.reasons import Reason, UnusableError
+from dicom_slice.usable import SliceRules, why_not_usable
 
 pytestmark = needs_shared
 

@@ -10,8 +10,8 @@ from pynetdicom import AE, evt
 from pynetdicom.association import Association
 from pynetdicom.dimse import DIMSEServiceProvider
 
-from dicom_listener.quirks import MR_IMAGE
 from dicom_listener.requestor import mended
+from dicom_slice.quirks import MR_IMAGE
 
 
 class DawdlingAssociation(Association):

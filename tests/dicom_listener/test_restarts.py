@@ -18,7 +18,7 @@ from dicom_listener.clock import ClockRules
 from dicom_listener.inbox import Envelope, Inbox, sha256_of
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
-from dicom_listener.quirks import MR_IMAGE
+from dicom_slice.quirks import MR_IMAGE
 
 _BEGAN_S = 1.75e9
 _HEAD_BYTES = 144

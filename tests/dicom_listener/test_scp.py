@@ -27,10 +27,10 @@ from pynetdicom.dimse_primitives import C_STORE
 from dicom_listener.inbox import Inbox, data_set_bytes, is_whole, read_envelope
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.negotiation import VERIFICATION
-from dicom_listener.quirks import MR_IMAGE
 from dicom_listener.requestor import mended
 from dicom_listener.scp import Scp, ScpRules, tls_context
 from dicom_listener.transport import acknowledge_at_once
+from dicom_slice.quirks import MR_IMAGE
 
 FOLDER = SHARED / "hazen" / "nist_T2_site4_philips_plate5"
 CT_IMAGE = "1.2.840.10008.5.1.4.1.1.2"

@@ -13,8 +13,8 @@ from listener_room import a_slice
 
 from dicom_listener.assign import Assigned, AssignRules, HoldWindow, Known, Pending, assign
 from dicom_listener.clock import ClockRules, OffsetBounds, ScannerClock, Sync, observe
-from dicom_listener.header import Slice
-from dicom_listener.times import AcquisitionInterval
+from dicom_slice.header import Slice
+from dicom_slice.times import AcquisitionInterval
 
 
 @dataclass(frozen=True)

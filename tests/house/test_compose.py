@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 import yaml
 
-from service.command_line import SUBCOMMANDS
+from service.cli.main import SUBCOMMANDS
 
 ROOT = Path(__file__).parents[2]
 COMPOSE = shutil.which("docker-compose")

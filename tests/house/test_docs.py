@@ -29,7 +29,7 @@ def test_the_example_room_is_valid():
 
 def names_defined() -> set[str]:
     found: set[str] = set()
-    for path in ROOT.glob("[a-z]*/*.py"):
+    for path in ROOT.glob("[a-z]*/**/*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
                 found.add(node.name)

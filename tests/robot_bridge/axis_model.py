@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 
-from robot_bridge.motors import MotorError, MotorStatus
+from robot_bridge.daemon.motors import MotorError, MotorStatus
 
 AXES = ("xt", "yt", "xb", "yb")
 NO_DRIVER = "no driver"
@@ -60,7 +60,7 @@ class Stage:
 
 
 class ModelMotors:
-    """Implements robot_bridge.motors.Motors over a Stage; forgets what a driver forgets."""
+    """Implements robot_bridge.daemon.motors.Motors over a Stage; forgets what a driver forgets."""
 
     def __init__(self, stage: Stage) -> None:
         self.stage = stage

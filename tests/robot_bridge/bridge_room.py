@@ -12,13 +12,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
-from robot_bridge.client import BridgeClient
-from robot_bridge.emulator import EmulatorServer, PseudoTerminal
-from robot_bridge.emulator_axis import EmulatedController, Motor
-from robot_bridge.emulator_bus import EmulatedBus
-from robot_bridge.emulator_physics import IdealStage, StagePhysics
-from robot_bridge.emulator_switches import Switches
-from robot_bridge.phases import WorkPhase
+from robot_bridge.client.client import BridgeClient
+from robot_bridge.emulator.axis import EmulatedController, Motor
+from robot_bridge.emulator.bus import EmulatedBus
+from robot_bridge.emulator.physics import IdealStage, StagePhysics
+from robot_bridge.emulator.server import EmulatorServer, PseudoTerminal
+from robot_bridge.emulator.switches import Switches
+from robot_bridge.protocol.phases import WorkPhase
 from simulator.serial_line import LineFaults, NullModem
 
 AXES = ("xt", "yt", "xb", "yb")

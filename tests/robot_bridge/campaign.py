@@ -14,9 +14,9 @@ from pathlib import Path
 from axis_model import AXES
 from virtual_room import VirtualRoom
 
-from robot_bridge.client import BridgeClient, LinkLostError, MoveOutcome, RefusedError
-from robot_bridge.messages import Code, CommandState
-from robot_bridge.phases import WorkPhase
+from robot_bridge.client.client import BridgeClient, LinkLostError, MoveOutcome, RefusedError
+from robot_bridge.protocol.messages import Code, CommandState
+from robot_bridge.protocol.phases import WorkPhase
 from simulator.serial_line import LineFaults
 
 SPAN_UM = 400  # moves are short, so that a campaign is long

@@ -8,14 +8,14 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-from robot_bridge.config import AxisConfig
-from robot_bridge.emulator import EmulatorServer, PseudoTerminal, TcpPort
-from robot_bridge.emulator_axis import EmulatedController, Motor
-from robot_bridge.emulator_bus import EmulatedBus
-from robot_bridge.emulator_physics import IdealStage
-from robot_bridge.emulator_switches import Switches
-from robot_bridge.motors import MotorStatus
-from robot_bridge.pmd401 import PmdMotors
+from robot_bridge.daemon.config import AxisConfig
+from robot_bridge.daemon.motors import MotorStatus
+from robot_bridge.emulator.axis import EmulatedController, Motor
+from robot_bridge.emulator.bus import EmulatedBus
+from robot_bridge.emulator.physics import IdealStage
+from robot_bridge.emulator.server import EmulatorServer, PseudoTerminal, TcpPort
+from robot_bridge.emulator.switches import Switches
+from robot_bridge.pmd.driver import PmdMotors
 
 SPEED_FACTOR = 20.0
 

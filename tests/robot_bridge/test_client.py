@@ -8,9 +8,9 @@ import pytest
 from axis_model import AXES
 from virtual_room import VirtualRoom
 
-from robot_bridge.client import LinkLostError, RefusedError
-from robot_bridge.messages import CommandState
-from robot_bridge.phases import WorkPhase
+from robot_bridge.client.client import LinkLostError, RefusedError
+from robot_bridge.protocol.messages import CommandState
+from robot_bridge.protocol.phases import WorkPhase
 from simulator.serial_line import LineFaults
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from bridge_room import AXES, BridgeRoom, bridge_room, wait_for
 
-from robot_bridge.command_line import main
+from robot_bridge.engineer.main import main
 from simulator.stage_physics import PiezoLegsStage, StageParameters
 
 
@@ -20,7 +20,7 @@ def robot(room: BridgeRoom, *arguments: str, link: bool = True) -> subprocess.Co
     where = ["--config", str(room.config_file), *where, "--by", "engineer", "--json", *arguments]
     if link:
         return in_this_process(where)
-    command = [sys.executable, "-m", "robot_bridge.command_line", *where]
+    command = [sys.executable, "-m", "robot_bridge.engineer.main", *where]
     return subprocess.run(command, capture_output=True, text=True, timeout=60)
 
 
@@ -139,7 +139,7 @@ def test_direct_commands_are_refused_while_the_daemon_runs(shared_room: BridgeRo
 def test_capture_writes_the_bytes_of_both_directions(tmp_path: Path):
     with bridge_room(tmp_path) as room:
         file = tmp_path / "capture.jsonl"
-        command = [sys.executable, "-m", "robot_bridge.command_line", "--config"]
+        command = [sys.executable, "-m", "robot_bridge.engineer.main", "--config"]
         command += [str(room.config_file), "--direct", "capture", str(file), "--seconds", "1"]
         ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
         assert ended.returncode == 0, ended.stderr
@@ -151,7 +151,7 @@ def test_status_reads_the_daemons_own_report_without_a_session(shared_room: Brid
     room = shared_room
     client = room.ready_client()
     wait_for(lambda: client.pump(0.05) or room.status_file()["armed"], 60, "the report")
-    command = [sys.executable, "-m", "robot_bridge.command_line", "--config"]
+    command = [sys.executable, "-m", "robot_bridge.engineer.main", "--config"]
     command += [str(room.config_file), "--json", "status"]
     ended = subprocess.run(command, capture_output=True, text=True, timeout=60)
     assert json.loads(ended.stdout)["pid"] == room.daemons[0].pid

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from robot_bridge.config import ConfigError, bridge_config_from_table, load_bridge_config
+from robot_bridge.daemon.config import ConfigError, bridge_config_from_table, load_bridge_config
 
 GOOD = """
 [bridge]

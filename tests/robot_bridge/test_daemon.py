@@ -11,9 +11,9 @@ from pathlib import Path
 import pytest
 from bridge_room import AXES, BridgeRoom, bridge_room, wait_for
 
-from robot_bridge.client import LinkLostError, MoveOutcome, RefusedError
-from robot_bridge.messages import CommandState
-from robot_bridge.phases import WorkPhase
+from robot_bridge.client.client import LinkLostError, MoveOutcome, RefusedError
+from robot_bridge.protocol.messages import CommandState
+from robot_bridge.protocol.phases import WorkPhase
 from simulator.serial_line import LineFaults
 
 FAR = dict.fromkeys(AXES, 14_000)  # about two seconds at full speed
@@ -98,8 +98,8 @@ SERVICE = """
 import sys
 sys.path.insert(0, {here!r})
 from bridge_room import AXES
-from robot_bridge.client import BridgeClient
-from robot_bridge.phases import WorkPhase
+from robot_bridge.client.client import BridgeClient
+from robot_bridge.protocol.phases import WorkPhase
 client = BridgeClient({url!r}, heartbeat_s=0.1)
 client.open(10.0)
 client.declare_position(dict.fromkeys(AXES, 0), "test")

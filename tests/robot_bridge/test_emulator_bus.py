@@ -10,9 +10,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from test_emulator_vectors import Bench, unparked
 
-from robot_bridge.emulator_axis import Motor
-from robot_bridge.emulator_switches import Switches
-from robot_bridge.pmd_status import Status, parse_status
+from robot_bridge.emulator.axis import Motor
+from robot_bridge.emulator.switches import Switches
+from robot_bridge.pmd.status import Status, parse_status
 
 
 def status(bench: Bench, address: int = 0) -> Status:

@@ -5,10 +5,10 @@ import random
 
 import pytest
 
-from robot_bridge.emulator_axis import EmulatedController, Motor
-from robot_bridge.emulator_bus import EmulatedBus
-from robot_bridge.emulator_physics import IdealStage
-from robot_bridge.emulator_switches import Switches
+from robot_bridge.emulator.axis import EmulatedController, Motor
+from robot_bridge.emulator.bus import EmulatedBus
+from robot_bridge.emulator.physics import IdealStage
+from robot_bridge.emulator.switches import Switches
 
 
 class Bench:

@@ -14,10 +14,10 @@ import cbor2
 import pytest
 from bridge_room import AXES, BridgeRoom, bridge_room, wait_for
 
-from robot_bridge import framing
-from robot_bridge.client import BridgeClient, LinkLostError, RefusedError
-from robot_bridge.framing import Deframer, Frame, FrameCounters, StopAckFrame
-from robot_bridge.messages import (
+from robot_bridge.client.client import BridgeClient, LinkLostError, RefusedError
+from robot_bridge.protocol import framing
+from robot_bridge.protocol.framing import Deframer, Frame, FrameCounters, StopAckFrame
+from robot_bridge.protocol.messages import (
     PROTOCOL_VERSION,
     SCHEMA,
     Answer,
@@ -35,8 +35,8 @@ from robot_bridge.messages import (
     pack,
     unpack,
 )
-from robot_bridge.phases import WorkPhase
-from robot_bridge.transport import SerialTransport
+from robot_bridge.protocol.phases import WorkPhase
+from robot_bridge.protocol.transport import SerialTransport
 from simulator.serial_line import LineFaults
 
 FAR = dict.fromkeys(AXES, 14_000)

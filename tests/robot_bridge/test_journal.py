@@ -8,8 +8,8 @@ from pathlib import Path
 
 import pytest
 
-from robot_bridge.journal import FILE_NAME, CommandRecord, Journal, JournalError, LatchedStop
-from robot_bridge.messages import CommandState
+from robot_bridge.daemon.journal import FILE_NAME, CommandRecord, Journal, JournalError, LatchedStop
+from robot_bridge.protocol.messages import CommandState
 
 SETPOINTS = {"xt": 1, "yt": 2}
 
@@ -95,7 +95,7 @@ import resource, sys
 from pathlib import Path
 sys.path.insert(0, {here!r})
 from test_journal import record, done
-from robot_bridge.journal import Journal, JournalError
+from robot_bridge.daemon.journal import Journal, JournalError
 journal = Journal(Path({folder!r}))
 journal.begin(record("a"), 1.0)
 size = journal.path.stat().st_size

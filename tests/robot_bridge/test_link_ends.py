@@ -4,10 +4,15 @@ import itertools
 
 import pytest
 
-from robot_bridge import framing
-from robot_bridge.bridge_end import BridgeEnd, MalformedReceived, RequestReceived, SessionOpened
-from robot_bridge.framing import Deframer, Frame, FrameCounters
-from robot_bridge.messages import (
+from robot_bridge.protocol import framing
+from robot_bridge.protocol.bridge_end import (
+    BridgeEnd,
+    MalformedReceived,
+    RequestReceived,
+    SessionOpened,
+)
+from robot_bridge.protocol.framing import Deframer, Frame, FrameCounters
+from robot_bridge.protocol.messages import (
     PROTOCOL_VERSION,
     SCHEMA,
     Answer,
@@ -16,7 +21,7 @@ from robot_bridge.messages import (
     HelloRequest,
     pack,
 )
-from robot_bridge.service_end import TRIES_MAX, Answered, GaveUp, ServiceEnd, SessionLost
+from robot_bridge.protocol.service_end import TRIES_MAX, Answered, GaveUp, ServiceEnd, SessionLost
 
 
 def hello_of(nonce: int):

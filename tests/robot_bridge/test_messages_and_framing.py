@@ -10,8 +10,8 @@ from cobs import cobs
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_bridge import framing, messages
-from robot_bridge.framing import (
+from robot_bridge.protocol import framing, messages
+from robot_bridge.protocol.framing import (
     Deframer,
     Frame,
     FrameCounters,
@@ -23,7 +23,7 @@ from robot_bridge.framing import (
     encode_stop,
     encode_stop_ack,
 )
-from robot_bridge.messages import (
+from robot_bridge.protocol.messages import (
     MESSAGES,
     AxisTravel,
     MessageError,

@@ -14,9 +14,9 @@ import pytest
 from axis_model import AXES
 from virtual_room import VirtualRoom
 
-from robot_bridge.bridge import Bridge
-from robot_bridge.bridge_end import RequestReceived, SessionOpened, StopReceived
-from robot_bridge.messages import (
+from robot_bridge.daemon.bridge import Bridge
+from robot_bridge.protocol.bridge_end import RequestReceived, SessionOpened, StopReceived
+from robot_bridge.protocol.messages import (
     Arm,
     Code,
     CommandState,
@@ -31,7 +31,7 @@ from robot_bridge.messages import (
     SetPhase,
     Status,
 )
-from robot_bridge.phases import ALLOWED, WorkPhase, may_follow, motion_allowed
+from robot_bridge.protocol.phases import ALLOWED, WorkPhase, may_follow, motion_allowed
 
 P = WorkPhase
 LATCHED = (P.STOP, P.EMERGENCY)
@@ -358,7 +358,7 @@ def test_there_is_no_other_request_than_those_tested_here():
     tested = {
         Arm, Rearm, Disarm, SetPhase, SetInsertionLock, DeclarePosition, Move, Home
     }  # fmt: skip
-    from robot_bridge.rules import _RULES
+    from robot_bridge.daemon.rules import _RULES
 
     assert set(_RULES) == tested
     assert RequestReceived.__annotations__["request"] is Message

@@ -7,11 +7,11 @@ import tty
 import pytest
 from pmd_rig import Rig, axis_config, finish, opened, rig, wait_until
 
-from robot_bridge.emulator_physics import IdealStage
-from robot_bridge.emulator_switches import Switches
-from robot_bridge.motors import MotorError
-from robot_bridge.pmd401 import PmdMotors
-from robot_bridge.pmd_ports import SerialPort
+from robot_bridge.daemon.motors import MotorError
+from robot_bridge.emulator.physics import IdealStage
+from robot_bridge.emulator.switches import Switches
+from robot_bridge.pmd.driver import PmdMotors
+from robot_bridge.pmd.ports import SerialPort
 
 
 def in_motion(motors: PmdMotors, made: Rig, um: int = 15_000) -> None:

@@ -6,10 +6,10 @@ import pytest
 from pmd_rig import axis_config, finish, opened, rig, wait_until
 from virtual_line import VirtualLine
 
-from robot_bridge.emulator_axis import Motor
-from robot_bridge.emulator_runs import OpenRun
-from robot_bridge.motors import POLL_BOUND_S, STOP_BOUND_S, MotorError
-from robot_bridge.pmd401 import UNTRIED, PmdMotors
+from robot_bridge.daemon.motors import POLL_BOUND_S, STOP_BOUND_S, MotorError
+from robot_bridge.emulator.axis import Motor
+from robot_bridge.emulator.runs import OpenRun
+from robot_bridge.pmd.driver import UNTRIED, PmdMotors
 
 
 @pytest.mark.parametrize("drive", ["open_loop", "closed_loop"])

@@ -12,8 +12,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from virtual_line import VirtualLine
 
-from robot_bridge.emulator_switches import LineFaults, Switches
-from robot_bridge.motors import MotorError, MotorStatus
+from robot_bridge.daemon.motors import MotorError, MotorStatus
+from robot_bridge.emulator.switches import LineFaults, Switches
 
 DAMAGE = (
     "drop_replies",
@@ -27,7 +27,7 @@ EVERY_PLACE = 40  # a move with an approach has some 30 lines
 
 @pytest.fixture(autouse=True)
 def quiet():
-    log = logging.getLogger("robot_bridge.pmd401")
+    log = logging.getLogger("robot_bridge.pmd.driver")
     before = log.level
     log.setLevel(logging.CRITICAL)
     yield

@@ -6,9 +6,9 @@ import pytest
 from pmd_rig import finish, opened, rig, wait_until
 from virtual_line import VirtualLine
 
-from robot_bridge.emulator_axis import Motor
-from robot_bridge.emulator_switches import Switches
-from robot_bridge.motors import POLL_BOUND_S, STOP_BOUND_S
+from robot_bridge.daemon.motors import POLL_BOUND_S, STOP_BOUND_S
+from robot_bridge.emulator.axis import Motor
+from robot_bridge.emulator.switches import Switches
 
 SINGLE = [
     Switches(terminator="cr"),

@@ -7,14 +7,14 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pmd_rig import axis_config, finish, opened, rig
 
-from robot_bridge.calibrate_steps import (
+from robot_bridge.daemon.motors import MotorError
+from robot_bridge.emulator.physics import IdealStage
+from robot_bridge.engineer.calibrate_steps import (
     CalibrationError,
     StepReading,
     calibrate_steps,
     step_lengths,
 )
-from robot_bridge.emulator_physics import IdealStage
-from robot_bridge.motors import MotorError
 from simulator.stage_physics import PiezoLegsStage, StageParameters
 
 

@@ -5,13 +5,13 @@ from pathlib import Path
 import pytest
 from pmd_rig import axis_config, finish, opened, rig, wait_until
 
-from robot_bridge.capture import (
+from robot_bridge.pmd.capture import (
     CaptureError,
     ReplayMismatchError,
     ReplayPort,
     read_capture,
 )
-from robot_bridge.pmd401 import PmdMotors
+from robot_bridge.pmd.driver import PmdMotors
 
 
 def captured_session(folder: Path) -> tuple[Path, str, dict]:

@@ -6,8 +6,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_bridge import pmd_protocol
-from robot_bridge.pmd_protocol import (
+from robot_bridge.pmd import protocol as pmd_protocol
+from robot_bridge.pmd.protocol import (
     Command,
     LineReader,
     PmdCommandError,
@@ -19,8 +19,8 @@ from robot_bridge.pmd_protocol import (
     Reply,
     match_reply,
 )
-from robot_bridge.pmd_status import Status, format_status, names, parse_status, parse_supply
-from robot_bridge.pmd_status import parse_drive as parse_drive_limits
+from robot_bridge.pmd.status import Status, format_status, names, parse_status, parse_supply
+from robot_bridge.pmd.status import parse_drive as parse_drive_limits
 
 
 def microsteps_meant(body: str) -> int:

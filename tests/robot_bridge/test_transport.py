@@ -9,9 +9,9 @@ from pathlib import Path
 import pytest
 from bridge_room import AXES, bridge_room
 
-from robot_bridge.client import BridgeClient, LinkLostError
-from robot_bridge.phases import WorkPhase
-from robot_bridge.transport import DescriptorTransport, SerialTransport, TransportError
+from robot_bridge.client.client import BridgeClient, LinkLostError
+from robot_bridge.protocol.phases import WorkPhase
+from robot_bridge.protocol.transport import DescriptorTransport, SerialTransport, TransportError
 
 
 class TcpRelay:

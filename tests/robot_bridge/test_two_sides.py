@@ -18,8 +18,8 @@ from hypothesis.stateful import (
     rule,
 )
 
-from robot_bridge import framing
-from robot_bridge.bridge_end import (
+from robot_bridge.protocol import framing
+from robot_bridge.protocol.bridge_end import (
     BridgeEnd,
     HeartbeatReceived,
     MalformedReceived,
@@ -27,7 +27,7 @@ from robot_bridge.bridge_end import (
     SessionOpened,
     StopReceived,
 )
-from robot_bridge.messages import (
+from robot_bridge.protocol.messages import (
     PROTOCOL_VERSION,
     SCHEMA,
     Answer,
@@ -36,7 +36,7 @@ from robot_bridge.messages import (
     Hello,
     Status,
 )
-from robot_bridge.service_end import (
+from robot_bridge.protocol.service_end import (
     Answered,
     GaveUp,
     HelloReceived,

@@ -7,12 +7,12 @@ import random
 
 from pmd_rig import axis_config
 
-from robot_bridge.emulator_axis import EmulatedController, Motor
-from robot_bridge.emulator_bus import EmulatedBus
-from robot_bridge.emulator_physics import IdealStage
-from robot_bridge.emulator_switches import Switches
-from robot_bridge.motors import MotorStatus
-from robot_bridge.pmd401 import PmdMotors
+from robot_bridge.daemon.motors import MotorStatus
+from robot_bridge.emulator.axis import EmulatedController, Motor
+from robot_bridge.emulator.bus import EmulatedBus
+from robot_bridge.emulator.physics import IdealStage
+from robot_bridge.emulator.switches import Switches
+from robot_bridge.pmd.driver import PmdMotors
 
 READ_WAIT_S = 0.002
 

@@ -11,12 +11,12 @@ from pathlib import Path
 
 from axis_model import AXES, ModelMotors, Stage
 
-from robot_bridge.bridge import Bridge
-from robot_bridge.bridge_settings import BridgeSettings
-from robot_bridge.client import BridgeClient
-from robot_bridge.framing import Deframer, FrameCounters, StopFrame
-from robot_bridge.journal import FILE_NAME, CommandRecord, Journal
-from robot_bridge.messages import AxisTravel
+from robot_bridge.client.client import BridgeClient
+from robot_bridge.daemon.bridge import Bridge
+from robot_bridge.daemon.bridge_settings import BridgeSettings
+from robot_bridge.daemon.journal import FILE_NAME, CommandRecord, Journal
+from robot_bridge.protocol.framing import Deframer, FrameCounters, StopFrame
+from robot_bridge.protocol.messages import AxisTravel
 from simulator.serial_line import FaultyDirection, LineFaults
 
 STEP_S = 0.004

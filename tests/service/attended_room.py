@@ -11,9 +11,9 @@ from typing import TypeVar
 
 import numpy as np
 
-from service.children import autospine
+from room_config.shell import autospine
 from service.client import RoomClient
-from service.state import RoomState
+from service.room.state import RoomState
 from simulator.demo_room import DemoOptions, DemoRoom
 from simulator.truth_client import TruthAddress, ask_path
 

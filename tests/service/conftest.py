@@ -9,8 +9,8 @@ from httpx._config import DEFAULT_TIMEOUT_CONFIG
 from offline_arguments import calibration_arguments
 from playwright.sync_api import Browser, Page, expect
 
-from service.calibration import Calibration, calibrate
 from service.client import RoomClient
+from service.procedure.calibration import Calibration, calibrate
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
 from studies.offline_room import MrImaging, OfflineRoom

@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from service.children import autospine
+from room_config.shell import autospine
 
 # a serial device on which nobody answers; both ends stay open as long as the tests run
 _FAR_END, _NEAR_END = os.openpty()

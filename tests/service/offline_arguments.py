@@ -2,9 +2,9 @@
 
 import numpy as np
 
-from service.approach import ApproachArguments
-from service.calibration import Calibration, CalibrationArguments
-from service.sensing import ValidationGate
+from service.procedure.approach import ApproachArguments
+from service.procedure.calibration import Calibration, CalibrationArguments
+from service.procedure.sensing import ValidationGate
 from sr_engine.shiftset import named
 
 GATE = ValidationGate(

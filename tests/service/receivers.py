@@ -26,7 +26,7 @@ from pynetdicom.sop_class import (
 )
 
 from room_config.load import Config
-from service.outbox_process import serve
+from service.dicom_out.outbox_process import serve
 
 SOP_CLASSES = (
     MRImageStorage,
@@ -145,7 +145,7 @@ class OutboxProcess:
     def __init__(self, config: Config, log: Path) -> None:
         with log.open("ab") as errors:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "service.outbox_process"],
+                [sys.executable, "-m", "service.dicom_out.outbox_process"],
                 stdin=subprocess.PIPE,
                 stderr=errors,
                 env={**os.environ, "OMP_NUM_THREADS": "1"},

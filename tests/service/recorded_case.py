@@ -11,11 +11,11 @@ from virtual_slices import write_slice
 
 from case_record.record import CaseRecord
 from case_record.rows import NewSlice
-from dicom_listener.header import read_header
 from dicom_listener.slice_rows import header_for_record
-from service.procedures import APPROACH
-from service.steps import HoldShift
-from service.targets import TARGET_SET
+from dicom_slice.header import read_header
+from service.procedure.registry import APPROACH
+from service.procedure.steps import HoldShift
+from service.procedure.targets import TARGET_SET
 from simulator.config import SliceProtocol, VirtualRoom
 from sr_engine.worker import measure
 

@@ -14,8 +14,8 @@ import trustme
 from lone_service import CONFIG, running_service
 
 from room_config.service import AccessToken
-from service.access import Access, AccessRules, LockedOutError, new_token, token_hash
-from service.children import autospine
+from room_config.shell import autospine
+from service.web.access import Access, AccessRules, LockedOutError, new_token, token_hash
 from simulator.config import ScannerSettings, VirtualRoomError
 from simulator.scan_operator import read_token
 

@@ -12,9 +12,9 @@ from attended_room import AttendedRoom, calibrated, stop_all, wait_for
 from PIL import Image
 
 from case_record.record import CaseRecord
-from dicom_listener.pixels import magnitude_pixels
+from dicom_slice.pixels import magnitude_pixels
 from service.client import RefusedByServiceError, RoomClient, ServiceGoneError
-from service.state import RoomState
+from service.room.state import RoomState
 
 
 @pytest.fixture

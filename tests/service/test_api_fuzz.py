@@ -28,8 +28,8 @@ from schemathesis.specs.openapi.checks import (
     unsupported_method,
 )
 
-from service.access import new_token, token_hash
 from service.client import RoomClient
+from service.web.access import new_token, token_hash
 
 PATIENCE_S = 300.0
 _FEW, _MANY, _SLOW_ONES = 8, 150, 3

@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 from offline_arguments import approach_arguments, beside, calibration_arguments
 
-from service.approach import SteeredFiducial, approach
-from service.calibration import calibrate
-from service.estimate import FiducialEstimate
-from service.sensing import ProcedureFailedError
-from service.steering import CONFIRM, REJECT
-from service.steps import AskOperator, MoveTo
+from service.procedure.approach import SteeredFiducial, approach
+from service.procedure.calibration import calibrate
+from service.procedure.estimate import FiducialEstimate
+from service.procedure.sensing import ProcedureFailedError
+from service.procedure.steering import CONFIRM, REJECT
+from service.procedure.steps import AskOperator, MoveTo
 from simulator.config import Placement, StaticObject, VirtualRoom
 from simulator.stage_physics import StageParameters
 from studies.offline_room import MrImaging, OfflineRoom

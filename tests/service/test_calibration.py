@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 from offline_arguments import GATE, calibration_arguments
 
-from service.calibration import calibrate
-from service.looking import STRATEGIES, look_at_fiducial
-from service.sensing import ProcedureFailedError, move
-from service.steps import MoveTo
+from service.procedure.calibration import calibrate
+from service.procedure.sensing import ProcedureFailedError, move
+from service.procedure.steps import MoveTo
+from service.procedure.strategies import STRATEGIES, look_at_fiducial
 from simulator.config import Fiducial, StaticObject, VirtualRoom
 from simulator.stage_physics import StageParameters
 from sr_engine.shiftset import named

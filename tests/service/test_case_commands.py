@@ -14,19 +14,19 @@ import pytest
 from offline_arguments import approach_arguments, beside, calibration_arguments
 
 from case_record.record import FILE_NAME, CaseRecord
-from service.procedures import (
+from service.cli.replay import replay_measurements
+from service.procedure.registry import (
     APPROACH,
     CALIBRATION,
 )
-from service.procedures import (
+from service.procedure.registry import (
     approach_arguments as approach_json,
 )
-from service.procedures import (
+from service.procedure.registry import (
     calibration_arguments as calibration_json,
 )
-from service.replay import replay_measurements
-from service.sensing import ProcedureFailedError
-from service.steps import Acquire
+from service.procedure.sensing import ProcedureFailedError
+from service.procedure.steps import Acquire
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
 from sr_engine.shiftset import named

@@ -6,8 +6,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from scipy.stats import ncx2
 
-from service.estimate import FiducialEstimate, MotionNoise, probability_within
-from service.jacobian import ImageJacobian
+from service.procedure.estimate import FiducialEstimate, MotionNoise, probability_within
+from service.procedure.jacobian import ImageJacobian
 
 HERE = {"xt": 0, "yt": 0}
 offsets = st.floats(-0.3, 0.3)

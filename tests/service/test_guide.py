@@ -8,27 +8,27 @@ import pytest
 from offline_arguments import GATE
 
 from case_record.record import CaseRecord
-from service.calibration import Calibration
-from service.guide_approach import GuideApproachArguments, approach_guide
-from service.guide_calibration import GuideCalibrationArguments, calibrate_guide
-from service.guide_geometry import (
+from service.cli.replay import replay_measurements, replay_procedure
+from service.procedure.calibration import Calibration
+from service.procedure.guide_approach import GuideApproachArguments, approach_guide
+from service.procedure.guide_calibration import GuideCalibrationArguments, calibrate_guide
+from service.procedure.guide_geometry import (
     GuideGeometry,
     GuideSeenWrongError,
     line_of_state,
     state_on_line,
     tip_of,
 )
-from service.guide_recording import GuideRecordingArguments, record_guide
-from service.procedures import (
+from service.procedure.guide_recording import GuideRecordingArguments, record_guide
+from service.procedure.registry import (
     GUIDE_APPROACH,
     GUIDE_CALIBRATION,
     guide_approach_arguments,
     guide_calibration_arguments,
 )
-from service.replay import replay_measurements, replay_procedure
-from service.sensing import ProcedureFailedError
-from service.steering import REJECT
-from service.targets import needle_line
+from service.procedure.sensing import ProcedureFailedError
+from service.procedure.steering import REJECT
+from service.procedure.targets import needle_line
 from simulator.config import Fiducial, VirtualRoom
 from simulator.mr_slice import slice_geometry
 from simulator.scene import true_fiducials_mm

@@ -5,10 +5,10 @@ from test_guide import APART, LOWER, PLANE, UPPER, make_room
 from test_guide import calibration_arguments as guide_calibration
 
 from room_config.load import Config, ConfigError, load_config
-from service.guide_calibration import calibrate_guide
-from service.guide_plan import geometry_of, guide_approach_of, guide_calibration_of
-from service.plan import PlanRefusedError, Travel
-from service.targets import Target, TargetError
+from service.procedure.guide_calibration import calibrate_guide
+from service.procedure.guide_plan import geometry_of, guide_approach_of, guide_calibration_of
+from service.procedure.plan import PlanRefusedError, Travel
+from service.procedure.targets import Target, TargetError
 
 ROOM = """
 [room]

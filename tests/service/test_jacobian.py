@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.jacobian import CalibrationError, ImageJacobian
+from service.procedure.jacobian import CalibrationError, ImageJacobian
 
 AXES = ("xt", "yt")
 angles = st.floats(-180, 180)

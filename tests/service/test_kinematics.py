@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.kinematics import (
+from service.procedure.kinematics import (
     AXES,
     KinematicsError,
     Line,

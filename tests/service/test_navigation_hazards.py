@@ -13,19 +13,19 @@ import pytest
 from offline_arguments import approach_arguments, beside, calibration_arguments
 
 from case_record.record import CaseRecord
-from service.approach import approach
-from service.calibration import calibrate
-from service.plan import PLAN_VOID, why_void
-from service.procedures import (
+from service.procedure.approach import approach
+from service.procedure.calibration import calibrate
+from service.procedure.plan import PLAN_VOID, why_void
+from service.procedure.registry import (
     APPROACH,
     CALIBRATION,
     build_procedure,
 )
-from service.procedures import approach_arguments as approach_json
-from service.procedures import calibration_arguments as calibration_json
-from service.runner import ReplayMismatchError, run_procedure
-from service.sensing import ABORT, RESCAN, ProcedureFailedError
-from service.steps import AskOperator, Measure, Moved, MoveTo
+from service.procedure.registry import approach_arguments as approach_json
+from service.procedure.registry import calibration_arguments as calibration_json
+from service.procedure.runner import ReplayMismatchError, run_procedure
+from service.procedure.sensing import ABORT, RESCAN, ProcedureFailedError
+from service.procedure.steps import AskOperator, Measure, Moved, MoveTo
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
 from sr_engine.shiftset import named
@@ -109,7 +109,7 @@ def test_h2_a_plan_is_void_once_there_is_a_newer_measurement(calibrated):
 
 
 def _one_hold(hold_id):
-    from service.steps import HoldShift
+    from service.procedure.steps import HoldShift
 
     return (HoldShift(hold_id, (0.0, 0.0)),)
 

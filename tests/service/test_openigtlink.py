@@ -11,13 +11,14 @@ import pytest
 from lone_service import CONFIG, ready_service
 
 from case_record.record import CaseRecord
+from dicom_slice.geometry import SliceGeometry
 from room_config.load import ConfigError, load_config
 from room_config.openigtlink import OpenIgtLinkConfig
 from service.client import RoomClient
-from service.igtl_scene import scene_of
-from service.igtl_server import bind_openigtlink
-from service.images import slice_pixels
-from service.openigtlink import (
+from service.procedure.steps import Acquire, HoldShift, Measure
+from service.room.images import slice_pixels
+from service.room.state import ArrivalState, MeasurementState, RoomState
+from service.slicer.messages import (
     HEADER,
     STATUS_NOT_READY,
     Point,
@@ -27,11 +28,10 @@ from service.openigtlink import (
     status,
     transform,
 )
-from service.state import ArrivalState, MeasurementState, RoomState
-from service.steps import Acquire, HoldShift, Measure
+from service.slicer.scene import scene_of
+from service.slicer.server import bind_openigtlink
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
-from sr_engine.geometry import SliceGeometry
 from studies.offline_room import MrImaging
 from studies.recorded_room import RecordedRoom
 

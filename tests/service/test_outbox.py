@@ -32,8 +32,8 @@ from recorded_case import add_measurement, come_to_ready, make_case, puncture
 
 from case_record.record import CaseRecord
 from room_config.load import ConfigError, load_config
-from service.outbox_store import OutboxStore
-from service.outputs import FOLDER, make_output, outputs_to_send
+from service.dicom_out.make import FOLDER, make_output, outputs_to_send
+from service.dicom_out.outbox_store import OutboxStore
 
 DESTINATION = """
 [[outputs.destination]]

@@ -17,10 +17,17 @@ from receivers import needs_program
 from recorded_case import OFFSET_MM, TOLERANCE_MM, come_to_ready, make_case, puncture
 
 from case_record.record import CaseRecord, CaseRecordError
-from service.export import write_export
-from service.finding import finding_of_arrival, finding_of_measurement
-from service.output_codes import CENTRE, CENTRE_ALONG, DEPTH, DISTANCE, PROBABILITY, TOLERANCE
-from service.outputs import Output, OutputError, dataset_of, make_output, output_of, outputs_to_send
+from service.cli.export import write_export
+from service.dicom_out.codes import CENTRE, CENTRE_ALONG, DEPTH, DISTANCE, PROBABILITY, TOLERANCE
+from service.dicom_out.errors import OutputError
+from service.dicom_out.finding import finding_of_arrival, finding_of_measurement
+from service.dicom_out.make import (
+    Output,
+    dataset_of,
+    make_output,
+    output_of,
+    outputs_to_send,
+)
 
 READY_REPORT = Output("approach", 1, "report")
 READY_PRESENTATION = Output("approach", 1, "presentation")
@@ -293,7 +300,13 @@ def test_what_there_is_nothing_about_is_refused(record):
 
 
 def test_the_command_says_in_one_line_why_it_makes_none(record):
-    words = [sys.executable, "-m", "service.outputs", str(record.case_dir), "approach-99-report"]
+    words = [
+        sys.executable,
+        "-m",
+        "service.dicom_out.make",
+        str(record.case_dir),
+        "approach-99-report",
+    ]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 2
     assert done.stderr.strip().splitlines()[-1].endswith("procedure 99 did not come to READY")

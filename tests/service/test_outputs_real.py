@@ -14,11 +14,12 @@ import pydicom
 import pytest
 
 from case_record.rows import Measurement, SliceRow
-from dicom_listener.header import Slice, read_header
-from dicom_listener.reasons import UnusableError
 from dicom_listener.slice_rows import header_for_record
-from service.finding import Distance, Finding
-from service.outputs import Output, OutputError, dataset_of
+from dicom_slice.header import Slice, read_header
+from dicom_slice.reasons import UnusableError
+from service.dicom_out.errors import OutputError
+from service.dicom_out.finding import Distance, Finding
+from service.dicom_out.make import Output, dataset_of
 
 DICOM = Path(__file__).parents[2].parent / "shared" / "dicom"
 CENTRE_PX = (40.25, 51.5)

@@ -11,8 +11,8 @@ from attended_room import AttendedRoom, arm, calibrated, running_room, stop_all,
 from browser import laid_out, serious_violations, set_theme
 from playwright.sync_api import Browser, Page, expect
 
-from service.access import new_token, token_hash
 from service.client import RefusedByServiceError, RoomClient
+from service.web.access import new_token, token_hash
 
 SLOW_MS = 60_000
 STOP_LIMIT_S = 0.5

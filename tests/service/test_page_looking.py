@@ -17,7 +17,7 @@ from test_api_documents import copy_case
 
 from case_record.record import CaseRecord
 from service.client import RoomClient
-from service.state import RoomState
+from service.room.state import RoomState
 
 VIEW = ".view >> nth=0"
 # the first canvas of the slice: how bright it is on average, 0 to 255

@@ -5,9 +5,9 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.estimate import FiducialEstimate
-from service.jacobian import ImageJacobian
-from service.plan import PlanRefusedError, Travel, check_travel, plan_move
+from service.procedure.estimate import FiducialEstimate
+from service.procedure.jacobian import ImageJacobian
+from service.procedure.plan import PlanRefusedError, Travel, check_travel, plan_move
 
 COLUMNS = np.array([[0.02, 0.02, -0.99, -1.01], [1.0, 0.98, 0.03, 0.03]])
 JACOBIAN = ImageJacobian(("xt", "yt"), COLUMNS, np.eye(8) * 1e-8)

@@ -11,21 +11,21 @@ from test_guide import approach_arguments as guide_approach
 from test_guide import calibration_arguments as guide_calibration
 
 from case_record.rows import Procedure
-from service.calibration import Calibration
-from service.estimate import FiducialEstimate
-from service.jacobian import ImageJacobian
-from service.procedures import (
+from service.procedure.calibration import Calibration
+from service.procedure.estimate import FiducialEstimate
+from service.procedure.jacobian import ImageJacobian
+from service.procedure.registry import (
     APPROACH,
     CALIBRATION,
     GUIDE_APPROACH,
     GUIDE_CALIBRATION,
     build_procedure,
 )
-from service.procedures import approach_arguments as recorded_approach
-from service.procedures import calibration_arguments as recorded_calibration
-from service.procedures import guide_approach_arguments as recorded_guide_approach
-from service.procedures import guide_calibration_arguments as recorded_guide_calibration
-from service.steps import Acquire, MoveTo
+from service.procedure.registry import approach_arguments as recorded_approach
+from service.procedure.registry import calibration_arguments as recorded_calibration
+from service.procedure.registry import guide_approach_arguments as recorded_guide_approach
+from service.procedure.registry import guide_calibration_arguments as recorded_guide_calibration
+from service.procedure.steps import Acquire, MoveTo
 
 
 def start(axes):

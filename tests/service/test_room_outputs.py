@@ -9,7 +9,7 @@ from attended_room import AttendedRoom, calibrated, running_room, wait_for
 from receivers import ARCHIVE, receiving, wait_until
 
 from service.client import RoomClient
-from service.state import RoomState
+from service.room.state import RoomState
 
 _PATIENCE_S = 120.0
 

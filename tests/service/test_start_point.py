@@ -5,12 +5,12 @@ import pytest
 from offline_arguments import approach_arguments, beside, calibration_arguments
 
 from case_record.record import CaseRecord
-from service.estimate import MotionNoise
-from service.procedures import APPROACH, CALIBRATION
-from service.procedures import approach_arguments as approach_json
-from service.procedures import calibration_arguments as calibration_json
-from service.start_point import POSITION_DECLARED, positions_to_declare, start_point
-from service.steps import MoveTo
+from service.procedure.estimate import MotionNoise
+from service.procedure.registry import APPROACH, CALIBRATION
+from service.procedure.registry import approach_arguments as approach_json
+from service.procedure.registry import calibration_arguments as calibration_json
+from service.procedure.start_point import POSITION_DECLARED, positions_to_declare, start_point
+from service.procedure.steps import MoveTo
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
 from studies.offline_room import MrImaging

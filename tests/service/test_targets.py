@@ -8,11 +8,11 @@ from test_guide import approach_arguments as guide_arguments
 from test_guide import calibration_arguments as guide_calibration
 
 from case_record.record import CaseRecord
-from service.approach import approach
-from service.calibration import calibrate
-from service.guide_approach import approach_guide
-from service.guide_calibration import calibrate_guide
-from service.targets import (
+from service.procedure.approach import approach
+from service.procedure.calibration import calibrate
+from service.procedure.guide_approach import approach_guide
+from service.procedure.guide_calibration import calibrate_guide
+from service.procedure.targets import (
     Target,
     TargetError,
     all_targets,

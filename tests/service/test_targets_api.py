@@ -7,7 +7,7 @@ import pytest
 from attended_room import AttendedRoom, calibrated, stop_all, wait_for
 
 from service.client import RefusedByServiceError, RoomClient
-from service.state import QuestionState, RoomState
+from service.room.state import QuestionState, RoomState
 from simulator.config import parse_virtual_room
 from simulator.scene import true_fiducial_mm
 from simulator.truth_client import TruthAddress, ask_where

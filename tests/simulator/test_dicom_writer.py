@@ -15,12 +15,12 @@ from hypothesis import strategies as st
 from pydicom import dcmread
 from pydicom.dataset import Dataset
 
+from dicom_slice.geometry import SliceGeometry
 from simulator.config import SliceProtocol, VirtualRoom, parse_virtual_room
 from simulator.dicom_writer import AcquisitionStamp, Series, Study, ds_values, write_mr_image
 from simulator.enhanced_writer import write_enhanced_mr_image
 from simulator.faults import phase_of
 from simulator.mr_slice import AcquiredSlice, acquire
-from sr_engine.geometry import SliceGeometry
 
 NOW_S = 1_790_000_000.123456
 

@@ -12,9 +12,9 @@ from pathlib import Path
 
 import pytest
 
-from robot_bridge.config import AxisConfig
-from robot_bridge.motors import MotorStatus
-from robot_bridge.pmd401 import PmdMotors
+from robot_bridge.daemon.config import AxisConfig
+from robot_bridge.daemon.motors import MotorStatus
+from robot_bridge.pmd.driver import PmdMotors
 
 
 class Room:

@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from robot_bridge.pmd_protocol import MICROSTEPS_PER_STEP
+from robot_bridge.pmd.protocol import MICROSTEPS_PER_STEP
 from simulator.motion_truth import MotionTruth
 from simulator.stage_physics import PiezoLegsStage, StageParameters
 

@@ -16,11 +16,11 @@ import pytest
 from neighbours import Page, Receiver, Stages, Start
 from pydicom import dcmread
 
+from dicom_slice.geometry import SliceGeometry
 from simulator.config import VirtualRoom, VirtualRoomError
 from simulator.mr_slice import acquire
 from simulator.scan_operator import operate
 from simulator.scene import true_fiducial_mm
-from sr_engine.geometry import SliceGeometry
 
 
 def geometry_of(dataset: Any) -> SliceGeometry:

@@ -13,8 +13,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from dicom_listener.read import read_frames
-from dicom_listener.reasons import UnusableError
+from dicom_slice.read import read_frames
+from dicom_slice.reasons import UnusableError
 from sr_engine.detect import detect
 from sr_engine.errors import EngineError, ParameterError
 from sr_engine.localize import localize

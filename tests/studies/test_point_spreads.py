@@ -8,8 +8,8 @@ import pytest
 
 from case_record.record import CaseRecord
 from room_config.imaging import PointSpreadConfig
-from service.replay import replay_measurements
-from service.steps import Acquire, HoldShift, Measure
+from service.cli.replay import replay_measurements
+from service.procedure.steps import Acquire, HoldShift, Measure
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
 from sr_engine.worker import PointSpreads, measure

@@ -11,7 +11,7 @@ import pytest
 from scipy.stats import chi2
 
 from case_record.record import CaseRecord
-from service.procedures import GUIDE_APPROACH, GUIDE_CALIBRATION
+from service.procedure.registry import GUIDE_APPROACH, GUIDE_CALIBRATION
 from simulator.config import parse_virtual_room
 from simulator.scene import true_guide
 

@@ -1,0 +1,165 @@
+"""The one motion in flight, from its acceptance to its end, and what is known of the position.
+
+What a motion does next is decided in `motion`; here it is done to the motors and journalled. Only
+the bridge's loop calls this, so at most one motion is ever between acceptance and end.
+"""
+
+from collections import Counter
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+
+from robot_bridge.daemon.bridge_journal import BridgeJournal
+from robot_bridge.daemon.journal import CommandRecord, JournalError
+from robot_bridge.daemon.motion import (
+    Ending,
+    Faulty,
+    Motion,
+    Over,
+    Overdue,
+    Runs,
+    RunsOut,
+    progress,
+)
+from robot_bridge.daemon.motor_watch import MotorWatch
+from robot_bridge.daemon.motors import MotorError
+from robot_bridge.protocol.messages import TEXT_MAX, Code, CommandState
+
+
+class MotionInFlight:
+    """`last_motion` names what moved the robot last, or said where it is."""
+
+    def __init__(
+        self,
+        motors: MotorWatch,
+        journal: BridgeJournal,
+        clock: Callable[[], float],
+        *,
+        boot_id: str,
+        timeout_s: float,
+        stop_for: Callable[[Code, str], None],
+    ) -> None:
+        """`stop_for` is the bridge's: it stops and latches."""
+        self.last_motion = f"boot:{boot_id}"
+        self.last_command: CommandRecord | None = None
+        self.commands_done: Counter[str] = Counter()
+        self._motors = motors
+        self._journal = journal
+        self._clock = clock
+        self._boot_id = boot_id
+        self._timeout_s = timeout_s
+        self._stop_for = stop_for
+        self._motion: Motion | None = None
+        self._certain = False
+        self._declared = 0
+
+    @property
+    def command(self) -> CommandRecord | None:
+        """The command whose motion has not ended."""
+        return self._motion.record if self._motion else None
+
+    # --- the position -------------------------------------------------------------------------
+
+    @property
+    def certain(self) -> bool:
+        return self._certain and self._motors.status.certain
+
+    def heed_uncertainty(self) -> None:
+        """What was lost stays lost until homing or a declaration, whatever the motors say later.
+        While they home they may well be uncertain.
+        """
+        homing = self._motion is not None and self._motion.homing
+        if not self._motors.status.certain and not homing:
+            self._certain = False
+
+    def declare_position(self, positions_um: Mapping[str, int]) -> None:
+        """Raises MotorError."""
+        self._motors.motors.declare_position(positions_um)
+        self._certain = True
+        self._declared += 1
+        self.last_motion = f"declared:{self._boot_id}:{self._declared}"
+        self._motors.poll()
+
+    # --- begin --------------------------------------------------------------------------------
+
+    def accept(self, record: CommandRecord) -> None:
+        """It is journalled; the motors begin in the next `begin_if_due`."""
+        self._motion = Motion(record, self._clock())
+        self.last_command = record
+
+    def begin_if_due(self) -> None:
+        motion = self._motion
+        if motion is None or motion.started:
+            return
+        if motion.ending is not None:
+            self._finish(motion.ending)
+            return
+        motion.started = True
+        motion.record = replace(motion.record, state=CommandState.RUNNING)
+        self.last_command = motion.record
+        self.last_motion = motion.record.command_id
+        self._motors.begun()
+        try:
+            if motion.homing:
+                self._motors.motors.home()
+            else:
+                self._motors.motors.move_to(motion.record.setpoints_um)
+        except MotorError as error:
+            self._motors.stop()
+            self._finish(Ending(CommandState.FAILED, Code.MOTOR_FAULT, str(error)))
+
+    # --- go on --------------------------------------------------------------------------------
+
+    def follow(self, now_s: float) -> None:
+        """Act on the motors' newest status."""
+        motion = self._motion
+        if motion is None:
+            return
+        match progress(motion, self._motors.status, now_s, self._timeout_s):
+            case Runs():
+                return
+            case RunsOut():
+                self._motors.stop_again_if_due()
+            case Faulty(ending):
+                self._stop_for(ending.code, ending.text)
+                motion.ending = ending  # the latched stop does not say STOPPED of it
+            case Overdue(ending):
+                self.stop(ending)
+            case Over(ending):
+                self._finish(ending)
+
+    # --- end ----------------------------------------------------------------------------------
+
+    def stop(self, ending: Ending) -> None:
+        """Stop the motion in flight, if any, and decide how it will have ended (first one wins)."""
+        if self._motion is None:
+            return
+        self._motors.stop()
+        self.decide_end(ending)
+
+    def decide_end(self, ending: Ending) -> None:
+        if self._motion is not None:
+            self._motion.decide_end(ending, self._clock())
+
+    def _finish(self, ending: Ending) -> None:
+        assert self._motion is not None
+        motion, self._motion = self._motion, None
+        record = replace(
+            motion.record,
+            state=ending.state,
+            code=str(ending.code),
+            text=ending.text[:TEXT_MAX],
+            readback_um=dict(self._motors.status.readback_um),
+        )
+        if ending.state is CommandState.DONE and motion.homing:
+            self._certain = True
+        try:
+            self._journal.end(record)
+        except JournalError as error:
+            # After a restart the journal would say FAILED; so it has failed, now and then.
+            record = replace(
+                record, state=CommandState.FAILED, code=Code.JOURNAL, text=str(error)[:TEXT_MAX]
+            )
+            self._journal.hold_unwritten(record)
+            self._stop_for(Code.JOURNAL, str(error))
+        self.last_command = record
+        self.commands_done[record.state.value] += 1

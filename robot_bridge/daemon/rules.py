@@ -1,0 +1,211 @@
+"""The rules: why a request is refused, as one pure function of how the bridge stands.
+
+`refusal` is the only place that says no. It is asked before anything is done, and what it lets
+pass still goes through the driver's own checks.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+from robot_bridge.daemon.travel import check_setpoints
+from robot_bridge.protocol.messages import (
+    NAME_MAX,
+    Arm,
+    AxisTravel,
+    Code,
+    DeclarePosition,
+    Disarm,
+    Home,
+    Message,
+    Move,
+    Rearm,
+    SetInsertionLock,
+    SetPhase,
+)
+from robot_bridge.protocol.phases import ALLOWED, WorkPhase, may_follow
+
+
+@dataclass(frozen=True)
+class Standing:
+    """How the bridge stands when a request arrives; all that the rules look at."""
+
+    phase: WorkPhase
+    armed: bool
+    stopped: bool
+    stop_reason: str
+    stop_count: int
+    insertion_locked: bool
+    in_flight: str | None
+    certain: bool
+    fault: str | None
+    last_motion: str
+    measurement_used: bool
+    now_ms: int
+    stale_after_ms: int
+    axes: tuple[AxisTravel, ...]
+
+
+Refusal = tuple[Code, str]
+
+
+def refusal(standing: Standing, request: Message) -> Refusal | None:
+    """The rule that `request` breaks and a text that names it, or None if it may be done."""
+    for rule in _RULES[type(request)]:
+        broken = rule(standing, request)
+        if broken is not None:
+            return broken
+    return None
+
+
+def is_fresh(now_ms: int, seen_ms: int, stale_after_ms: int) -> bool:
+    """Whether the sender saw our clock less than `stale_after_ms` ago (and not in our future)."""
+    return 0 <= now_ms - seen_ms <= stale_after_ms
+
+
+def _stale(standing: Standing, request: Message) -> Refusal | None:
+    seen_ms = getattr(request, "seen_ms")  # noqa: B009
+    if is_fresh(standing.now_ms, seen_ms, standing.stale_after_ms):
+        return None
+    return Code.STALE_COMMAND, (
+        f"sent {standing.now_ms - seen_ms} ms after the sender last heard from the bridge; "
+        f"at most {standing.stale_after_ms} ms are allowed"
+    )
+
+
+def _stale_unlock(standing: Standing, request: Message) -> Refusal | None:
+    # Locking is the safe direction and is never too late.
+    assert isinstance(request, SetInsertionLock)
+    return None if request.locked else _stale(standing, request)
+
+
+def _nobody(standing: Standing, request: Message) -> Refusal | None:
+    by = getattr(request, "by")  # noqa: B009
+    if len(by.strip()) > 0 and len(by) <= NAME_MAX:
+        return None
+    return Code.NO_OPERATOR, f"the request does not say by whom (1 to {NAME_MAX} characters)"
+
+
+def _nameless(standing: Standing, request: Message) -> Refusal | None:
+    assert isinstance(request, Move | Home)
+    if 0 < len(request.command_id) <= NAME_MAX:
+        return None
+    return Code.MALFORMED, f"the command id must have 1 to {NAME_MAX} characters"
+
+
+def _stop_latched(standing: Standing, request: Message) -> Refusal | None:
+    if not standing.stopped:
+        return None
+    return Code.STOP_LATCHED, (
+        f"stop {standing.stop_count} ({standing.stop_reason}) is latched until an operator re-arms"
+    )
+
+
+def _no_stop(standing: Standing, request: Message) -> Refusal | None:
+    return None if standing.stopped else (Code.NOT_STOPPED, "no stop is latched")
+
+
+def _wrong_stop(standing: Standing, request: Message) -> Refusal | None:
+    assert isinstance(request, Arm | Rearm)
+    if request.stop_count == standing.stop_count:
+        return None
+    return Code.WRONG_STOP, (
+        f"the request knows stop {request.stop_count}, the bridge has stop {standing.stop_count}"
+    )
+
+
+def _faulty(standing: Standing, request: Message) -> Refusal | None:
+    if standing.fault is None:
+        return None
+    return Code.MOTOR_FAULT, f"the motors report {standing.fault}"
+
+
+def _not_armed(standing: Standing, request: Message) -> Refusal | None:
+    return None if standing.armed else (Code.NOT_ARMED, "the bridge is not armed")
+
+
+def _locked(standing: Standing, request: Message) -> Refusal | None:
+    if not standing.insertion_locked:
+        return None
+    return Code.INSERTION_LOCKED, "the insertion lock is set: the needle may be in"
+
+
+def _in_flight(standing: Standing, request: Message) -> Refusal | None:
+    if standing.in_flight is None:
+        return None
+    return Code.MOTION_IN_FLIGHT, f"command {standing.in_flight!r} has not ended"
+
+
+def _phase_forbids_move(standing: Standing, request: Message) -> Refusal | None:
+    if ALLOWED[standing.phase].move:
+        return None
+    return Code.WRONG_PHASE, f"no motion in phase {standing.phase}"
+
+
+def _phase_forbids_home(standing: Standing, request: Message) -> Refusal | None:
+    if ALLOWED[standing.phase].home:
+        return None
+    return Code.WRONG_PHASE, f"no homing in phase {standing.phase}"
+
+
+def _phase_not_reachable(standing: Standing, request: Message) -> Refusal | None:
+    assert isinstance(request, SetPhase)
+    if request.phase not in WorkPhase.__members__:
+        return Code.MALFORMED, f"{request.phase[:40]!r} is not a work phase"
+    if may_follow(standing.phase, WorkPhase(request.phase)):
+        return None
+    return Code.PHASE_NOT_ALLOWED, f"{request.phase} may not follow {standing.phase}"
+
+
+def _beyond_travel(standing: Standing, request: Message) -> Refusal | None:
+    assert isinstance(request, Move)
+    return check_setpoints(request.setpoints_um, standing.axes)
+
+
+def _declared_beyond_travel(standing: Standing, request: Message) -> Refusal | None:
+    assert isinstance(request, DeclarePosition)
+    return check_setpoints(request.positions_um, standing.axes)
+
+
+def _uncertain(standing: Standing, request: Message) -> Refusal | None:
+    if standing.certain:
+        return None
+    return Code.POSITION_UNCERTAIN, "the position is uncertain: home or declare it first"
+
+
+def _outdated(standing: Standing, request: Message) -> Refusal | None:
+    assert isinstance(request, Move)
+    if request.based_on_motion != standing.last_motion:
+        return Code.OUTDATED_MEASUREMENT, (
+            f"outdated measurement: the move rests on motion {request.based_on_motion[:60]!r}, "
+            f"but the last one was {standing.last_motion[:60]!r}"
+        )
+    if standing.measurement_used:
+        return Code.OUTDATED_MEASUREMENT, (
+            f"outdated measurement: the robot has moved on {str(request.measurement_id)[:60]!r}"
+        )
+    return None
+
+
+Rule = Callable[[Standing, Any], Refusal | None]
+
+_MAY_MOVE: tuple[Rule, ...] = (
+    _nameless,
+    _stale,
+    _stop_latched,
+    _faulty,
+    _not_armed,
+    _locked,
+    _in_flight,
+)
+
+_RULES: dict[type[Message], tuple[Rule, ...]] = {
+    Arm: (_nobody, _stale, _stop_latched, _wrong_stop, _faulty),
+    Rearm: (_nobody, _stale, _no_stop, _wrong_stop, _in_flight, _faulty),
+    Disarm: (),
+    SetPhase: (_nobody, _stale, _stop_latched, _in_flight, _phase_not_reachable),
+    SetInsertionLock: (_nobody, _stale_unlock),
+    Move: (*_MAY_MOVE, _phase_forbids_move, _beyond_travel, _uncertain, _outdated),
+    Home: (*_MAY_MOVE, _nobody, _phase_forbids_home),
+    DeclarePosition: (_nobody, _stale, _in_flight, _declared_beyond_travel),
+}

@@ -1,0 +1,150 @@
+"""`autospine export CASE`: a case as one zip of DICOM files, JSON lines and images.
+
+Slices are as they were received, byte for byte, outputs as they were made; MANIFEST.json names
+every member with its SHA-256.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+import zipfile
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import asdict
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+
+from case_record.record import CaseRecord
+from service.dicom_out.make import FOLDER as OUTPUTS
+from service.room.images import (
+    ImageMissingError,
+    Rendering,
+    png_of,
+    reconstruction_pixels,
+    slice_pixels,
+)
+
+app = typer.Typer(add_completion=False)
+FORMAT = "autospine-case-export"
+FORMAT_VERSION = 1
+_EVENTS_AT_ONCE = 1000
+_SCALE = 3
+
+
+class ExportError(ValueError):
+    """The case cannot be exported as asked; one line."""
+
+    exit_code = 2
+
+
+@app.command()
+def export(
+    case: Annotated[Path, typer.Argument(help="The case's folder.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The zip to write; by default CASE.zip here.")
+    ] = None,
+    force: Annotated[bool, typer.Option(help="Replace a file that is there.")] = False,
+) -> None:
+    """Write a case as one zip: DICOM, JSON lines, images."""
+    target = out or Path(f"{case.resolve().name}.zip")
+    if target.exists() and not force:
+        raise ExportError(f"{target} is there already (--force replaces it)")
+    with CaseRecord(case) as record:
+        members = write_export(record, target)
+    print(f"{target}: {members} files")
+
+
+def write_export(record: CaseRecord, target: Path) -> int:
+    """Write the zip atomically; return the number of its members. The case is not changed."""
+    if record.case() is None:
+        raise ExportError(f"{record.case_dir}: no case was begun here")
+    record.verify_events()
+    fresh = target.with_name(target.name + ".part")
+    digests: dict[str, str] = {}
+    missing: list[str] = []
+    try:
+        with zipfile.ZipFile(fresh, "w", zipfile.ZIP_DEFLATED) as archive:
+            for name, content in _members(record, missing):
+                archive.writestr(name, content)
+                digests[name] = hashlib.sha256(content).hexdigest()
+            manifest = {
+                "format": FORMAT,
+                "version": FORMAT_VERSION,
+                "sha256": digests,
+                "missing": missing,
+            }
+            archive.writestr("MANIFEST.json", json.dumps(manifest, indent=1))
+        os.replace(fresh, target)
+    except OSError as error:
+        raise ExportError(f"{target}: cannot be written ({error.strerror})") from error
+    finally:
+        fresh.unlink(missing_ok=True)
+    return len(digests) + 1
+
+
+def tables(record: CaseRecord) -> Iterator[tuple[str, Iterable[Any]]]:
+    """Name and rows of every table of the record."""
+    procedures = record.procedures()
+    yield "case", [record.case()]
+    yield "events", _events(record)
+    yield "holds", record.holds()
+    yield "slices", record.slices()
+    yield "measurements", record.measurements()
+    yield "procedures", procedures
+    yield "steps", [step for row in procedures for step in record.steps(row.procedure_id)]
+    yield "moves", record.moves()
+
+
+def _events(record: CaseRecord) -> Iterator[Any]:
+    after = 0
+    while batch := record.events(after, _EVENTS_AT_ONCE):
+        yield from batch
+        after = batch[-1].event_id
+
+
+def _members(record: CaseRecord, missing: list[str]) -> Iterator[tuple[str, bytes]]:
+    for name, rows in tables(record):
+        yield f"{name}.jsonl", _json_lines(asdict(row) for row in rows)
+    seen: set[str] = set()
+    for row in record.slices():
+        path = record.case_dir / row.path
+        if row.path in seen:
+            continue
+        seen.add(row.path)
+        if not path.is_file():
+            missing.append(row.path)
+            continue
+        yield f"dicom/{Path(row.path).name}", path.read_bytes()
+    for path in sorted((record.case_dir / OUTPUTS).glob("*.dcm")):
+        yield f"outputs/{path.name}", path.read_bytes()
+    yield from _images(record)
+
+
+def _images(record: CaseRecord) -> Iterator[tuple[str, bytes]]:
+    """A PNG of every slice that was used, and of every reconstruction."""
+    how = Rendering(scale=_SCALE)
+    for row in record.slices(state="assigned"):
+        try:
+            yield (
+                f"images/slice-{row.slice_id}.png",
+                png_of(slice_pixels(record, row.slice_id), how),
+            )
+        except ImageMissingError:
+            continue
+    for measurement in record.measurements("done"):
+        try:
+            pixels = reconstruction_pixels(record, measurement.measurement_id)
+        except ImageMissingError:
+            continue
+        yield f"images/measurement-{measurement.measurement_id}.png", png_of(pixels, how)
+
+
+def _json_lines(rows: Iterable[Mapping[str, Any]]) -> bytes:
+    stream = io.StringIO()
+    for row in rows:
+        stream.write(json.dumps(row, allow_nan=False) + "\n")
+    return stream.getvalue().encode("utf-8")

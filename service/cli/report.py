@@ -1,0 +1,331 @@
+"""`autospine report CASE`: one page of a case, in one file: images, tables, plots."""
+
+from __future__ import annotations
+
+import base64
+import html
+import io
+import os
+from collections.abc import Iterable, Sequence
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.figure import Figure
+from matplotlib.patches import Ellipse
+
+from case_record.record import CaseRecord
+from case_record.rows import Measurement
+from service.procedure.registry import APPROACHES, CALIBRATIONS
+from service.room.history import known_targets, targets_over_time
+from service.room.images import ImageMissingError, slice_pixels
+
+app = typer.Typer(add_completion=False)
+_CROP_PX = 16
+_CHI2_95 = 5.991
+_STYLE = """
+body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 62rem; color: #222 }
+h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2rem }
+table { border-collapse: collapse } td, th { padding: .2rem .7rem; border-bottom: 1px solid #ddd }
+th { text-align: left; font-weight: 600 } td.n { text-align: right } img { max-width: 100% }
+.warning { background: #fff3cd; padding: .5rem .8rem }
+"""
+
+
+class ReportError(ValueError):
+    """The report cannot be written; one line."""
+
+    exit_code = 2
+
+
+@app.command()
+def report(
+    case: Annotated[Path, typer.Argument(help="The case's folder.")],
+    out: Annotated[
+        Path | None, typer.Option(help="The page to write; by default CASE-report.html here.")
+    ] = None,
+) -> None:
+    """Write one page of a case: images, tables, plots."""
+    target = out or Path(f"{case.resolve().name}-report.html")
+    with CaseRecord(case) as record:
+        page = report_page(record)
+    fresh = target.with_name(target.name + ".part")
+    try:
+        fresh.write_text(page, encoding="utf-8")
+        os.replace(fresh, target)
+    except OSError as error:
+        raise ReportError(f"{target}: cannot be written ({error.strerror})") from error
+    print(f"{target}: written")
+
+
+def report_page(record: CaseRecord) -> str:
+    """The whole page as HTML; it loads nothing."""
+    case = record.case()
+    if case is None:
+        raise ReportError(f"{record.case_dir}: no case was begun here")
+    events = record.verify_events()
+    title = f"{case.name}: {_time(case.created_s)}"
+    body = [
+        f"<h1>{html.escape(title)}</h1>",
+        '<p class="warning">Research software, not a medical device.</p>',
+        f"<p>Case {html.escape(case.case_uid)}, {events} events, their chain verifies.</p>",
+        *_targets(record),
+        *_approaches(record),
+        *_needles(record),
+        *_calibrations(record),
+        *_plots(record),
+        *_images(record),
+        *_measurements(record),
+        *_set_aside(record),
+        *_event_list(record),
+    ]
+    head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{_STYLE}</style>'
+    return f"<!DOCTYPE html><html lang=en><head>{head}</head><body>{''.join(body)}</body></html>\n"
+
+
+def _targets(record: CaseRecord) -> Iterable[str]:
+    rows = [
+        (
+            target.number,
+            target.label,
+            " ".join(f"{value:.3f}" for value in target.patient_mm),
+            "tissue" if target.in_water else "fiducial",
+            _time(target.set_s),
+            target.who,
+            ", ".join(str(number) for number in target.approaches),
+        )
+        for target in known_targets(record)
+    ]
+    yield "<h2>Targets</h2>"
+    yield _table(("no.", "label", "patient mm (LPS)", "of", "set", "by", "approaches"), rows)
+
+
+def _needles(record: CaseRecord) -> Iterable[str]:
+    """With two fiducials: where the needle's line runs at the end of each approach."""
+    rows = []
+    for row in record.procedures():
+        result = row.result or {}
+        if row.state != "done" or "tip_mm" not in result:
+            continue
+        covariance = np.array(result["tip_covariance_mm2"])
+        rows.append(
+            (
+                row.procedure_id,
+                *(" ".join(f"{x:.3f}" for x in result[name]) for name in ("joint_mm", "tip_mm")),
+                _number(result["tip_below_joint_mm"], 1, 1),
+                " ".join(f"{1000 * x:+.0f}" for x in result["tip_error_mm"]),
+                " ".join(f"{1000 * x:.0f}" for x in np.sqrt(np.diag(covariance))),
+                _number(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]), 1, 2),
+            )
+        )
+    if rows:
+        yield "<h2>Where the needle points</h2>"
+        heads = (
+            "approach",
+            "lower ball joint, patient mm",
+            "tip, patient mm",
+            "depth mm",
+            "tip error µm (row, col)",
+            "σ µm (row, col)",
+            "correlation",
+        )
+        yield _table(heads, rows)
+
+
+def _approaches(record: CaseRecord) -> Iterable[str]:
+    rows = []
+    for row in record.procedures():
+        if row.name not in APPROACHES:
+            continue
+        result = dict(row.result or {})
+        minutes = ((row.ended_s or row.started_s) - row.started_s) / 60
+        rows.append(
+            (
+                row.procedure_id,
+                row.name.replace("_", " "),
+                row.arguments.get("target", ""),
+                row.state,
+                *(_number(result.get(name), 1000) for name in ("error_mm", "sigma_mm")),
+                _number(result.get("probability"), 1, 3),
+                result.get("iterations", ""),
+                result.get("frames", ""),
+                f"{minutes:.1f}",
+                result.get("reason", ""),
+            )
+        )
+    yield "<h2>Approaches</h2>"
+    heads = (
+        "no.",
+        "",
+        "target",
+        "state",
+        "error µm",
+        "σ µm",
+        "P",
+        "moves",
+        "slices",
+        "min",
+        "reason",
+    )
+    yield _table(heads, rows)
+    yield f"<p>Punctures recorded: {len(record.events_of_kind('puncture'))}.</p>"
+
+
+def _calibrations(record: CaseRecord) -> Iterable[str]:
+    yield "<h2>Calibrations</h2>"
+    rows = []
+    for row in record.procedures():
+        if row.name not in CALIBRATIONS:
+            continue
+        found = dict(row.result or {})
+        columns = found.get("jacobian", {}).get("columns")
+        shown = (
+            "" if columns is None else "; ".join(" ".join(f"{x:+.4f}" for x in r) for r in columns)
+        )
+        axes = ", ".join(found.get("jacobian", {}).get("axes", ()))
+        rows.append((row.procedure_id, row.state, axes, shown, found.get("reason", "")))
+    heads = ("no.", "state", "axes", "image Jacobian mm/mm (rows; per axis up, down)", "reason")
+    yield _table(heads, rows)
+
+
+def _plots(record: CaseRecord) -> Iterable[str]:
+    """Error to the target of its time, with uncertainty, over the measurements."""
+    targets = targets_over_time(record)
+    numbers, errors, sigmas = [], [], []
+    for row in record.measurements("done"):
+        body = targets.body_of(row)
+        if body.error_mm is not None and body.sigma_mm is not None:
+            numbers.append(row.measurement_id)
+            errors.append(body.error_mm)
+            sigmas.append(body.sigma_mm)
+    if not numbers:
+        return
+    figure, axes = _figure(8, 3)
+    axes.errorbar(numbers, errors, yerr=sigmas, fmt=".", capsize=2)
+    axes.set(xlabel="measurement", ylabel="distance to target, mm", yscale="log")
+    axes.grid(visible=True, which="both", alpha=0.3)
+    yield "<h2>Distance to the target</h2>"
+    yield _image_tag(figure, "distance to the target over the measurements")
+
+
+def _images(record: CaseRecord) -> Iterable[str]:
+    """The last slice of every approach around the fiducial, with its 95 % ellipse."""
+    shown = []
+    for row in record.procedures():
+        if row.name in APPROACHES and row.state == "done" and row.result:
+            measurement = record.measurement(int(row.result["measurement_id"]))
+            tag = _close_up(record, measurement, f"approach {row.procedure_id}")
+            if tag:
+                shown.append(tag)
+    if shown:
+        yield "<h2>Where the fiducial was seen at the end of each approach</h2>"
+        yield from shown
+
+
+def _close_up(record: CaseRecord, measurement: Measurement, title: str) -> str:
+    found = measurement.result or {}
+    try:
+        pixels = slice_pixels(record, int(found["slice_id"]))
+    except (ImageMissingError, KeyError):
+        return ""
+    row, col = found["centre_px"]
+    figure, axes = _figure(3, 3)
+    axes.imshow(pixels, cmap="gray")
+    axes.set_xlim(col - _CROP_PX, col + _CROP_PX)
+    axes.set_ylim(row + _CROP_PX, row - _CROP_PX)
+    axes.set_title(f"{title}, measurement {measurement.measurement_id}", fontsize=9)
+    axes.axis("off")
+    axes.add_patch(Ellipse((col, row), *[2 * found["radius_px"]] * 2, fill=False, color="#4af"))
+    variances, vectors = np.linalg.eigh(np.array(found["covariance_px2"]))
+    height, width = 2 * np.sqrt(_CHI2_95 * variances)
+    angle = float(np.degrees(np.arctan2(vectors[0, 1], vectors[1, 1])))
+    axes.add_patch(Ellipse((col, row), width, height, angle=angle, fill=False, color="#fa4"))
+    return _image_tag(figure, title)
+
+
+def _measurements(record: CaseRecord) -> Iterable[str]:
+    rows = []
+    for row in record.measurements():
+        found = row.result or {}
+        sigma = None
+        if found:
+            sigma = float(np.sqrt(np.trace(np.array(found["covariance_mm2"])) / 2))
+        place = " ".join(f"{x:.3f}" for x in found.get("patient_mm", ()))
+        rows.append(
+            (
+                row.measurement_id,
+                row.method,
+                row.state,
+                found.get("n_frames", ""),
+                place,
+                _number(sigma, 1000),
+                _number(found.get("snr")),
+                _number(found.get("chi2_per_dof"), 1, 2),
+                row.reason,
+            )
+        )
+    yield "<h2>Measurements</h2>"
+    heads = (
+        "no.",
+        "method",
+        "state",
+        "slices",
+        "patient mm (LPS)",
+        "σ µm",
+        "SNR",
+        "χ²/dof",
+        "reason",
+    )
+    yield _table(heads, rows)
+
+
+def _set_aside(record: CaseRecord) -> Iterable[str]:
+    rows = [
+        (row.slice_id, _time(row.received_s), row.reason_code, row.reason)
+        for row in record.slices(state="quarantined")
+    ]
+    if rows:
+        yield "<h2>Slices that were set aside</h2>"
+        yield _table(("slice", "received", "code", "reason"), rows)
+
+
+def _event_list(record: CaseRecord) -> Iterable[str]:
+    rows = [
+        (event.event_id, _time(event.wall_s), event.source, event.who, event.kind)
+        for event in record.newest_events(500)
+    ]
+    yield "<h2>Events (the newest 500)</h2>"
+    yield _table(("no.", "time", "source", "who", "what"), sorted(rows))
+
+
+def _table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
+    first = "".join(f"<th>{html.escape(head)}</th>" for head in heads)
+    lines = [
+        "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>"
+        for row in rows
+    ]
+    return f"<table><tr>{first}</tr>{''.join(lines)}</table>" if lines else "<p>None.</p>"
+
+
+def _figure(width: float, height: float) -> tuple[Figure, Any]:
+    figure = Figure(figsize=(width, height), layout="constrained")
+    FigureCanvasAgg(figure)
+    return figure, figure.add_subplot()
+
+
+def _image_tag(figure: Figure, text: str) -> str:
+    stream = io.BytesIO()
+    figure.savefig(stream, format="png", dpi=110)
+    data = base64.b64encode(stream.getvalue()).decode("ascii")
+    return f'<img alt="{html.escape(text)}" src="data:image/png;base64,{data}">'
+
+
+def _number(value: Any, factor: float = 1.0, digits: int = 1) -> str:
+    return "" if value is None else f"{float(value) * factor:.{digits}f}"
+
+
+def _time(instant_s: float) -> str:
+    return datetime.fromtimestamp(instant_s, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")

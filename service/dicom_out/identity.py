@@ -1,0 +1,66 @@
+"""What all DICOM outputs have in common: UIDs that follow from the case, instants, the maker."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from importlib.metadata import version
+
+from pydicom.dataset import Dataset
+from pydicom.uid import UID, generate_uid
+
+from service.dicom_out.finding import Finding
+
+MAKER = "AutoSPINe Navigator"
+RESEARCH = "Research software, not a medical device. Not for diagnosis."
+SERIES_NUMBERS = {"image": 9001, "report": 9002, "presentation": 9003}
+_DESCRIPTION_CHARACTERS = 64
+
+
+def software_version() -> str:
+    return version("autospine")
+
+
+def output_uid(finding: Finding, *words: str) -> UID:
+    """The same for the same words in the same case, everywhere and always."""
+    return generate_uid(entropy_srcs=[finding.case_uid, *words])
+
+
+def series_uid(finding: Finding, kind: str, study_uid: str, frame_of_reference_uid: str) -> UID:
+    """One series a kind, study and frame of reference."""
+    return output_uid(finding, "series", kind, study_uid, frame_of_reference_uid)
+
+
+def subject_of(finding: Finding) -> tuple[str, int]:
+    """What it is about: a puncture, a READY, or a measurement, and its number."""
+    if finding.puncture is not None:
+        return "puncture", finding.puncture.event_id
+    if finding.arrival is not None:
+        return "approach", finding.arrival.procedure_id
+    return "measurement", finding.measurement.measurement_id
+
+
+def instant_s(finding: Finding) -> float:
+    """When what it is about happened, wall clock."""
+    if finding.puncture is not None:
+        return finding.puncture.wall_s
+    if finding.arrival is not None and finding.arrival.ended_s is not None:
+        return finding.arrival.ended_s
+    return finding.measurement.finished_s or finding.measurement.requested_s
+
+
+def stamp(dataset: Dataset, finding: Finding, kind: str, description: str) -> None:
+    """Instants, series and equipment; whatever the clock said while the object was made."""
+    made = datetime.fromtimestamp(instant_s(finding))
+    date, time = made.strftime("%Y%m%d"), made.strftime("%H%M%S.%f")
+    for name in ("SeriesDate", "ContentDate", "InstanceCreationDate"):
+        setattr(dataset, name, date)
+    for name in ("SeriesTime", "ContentTime", "InstanceCreationTime"):
+        setattr(dataset, name, time)
+    for equipment in dataset.get("ContributingEquipmentSequence") or ():
+        if "ContributionDateTime" in equipment:
+            equipment.ContributionDateTime = date + time
+    dataset.SeriesNumber = SERIES_NUMBERS[kind]
+    dataset.SeriesDescription = description[:_DESCRIPTION_CHARACTERS]
+    dataset.Manufacturer = MAKER
+    dataset.ManufacturerModelName = MAKER
+    dataset.SoftwareVersions = software_version()

@@ -1,0 +1,60 @@
+"""The reconstruction of a recorded measurement as a derived MR image."""
+
+from __future__ import annotations
+
+import numpy as np
+from pydicom.dataset import Dataset
+
+from dicom_slice.geometry import SliceGeometry
+from service.dicom_out.derived import derived_image
+from service.dicom_out.errors import OutputError
+from service.dicom_out.finding import Finding
+from service.dicom_out.identity import output_uid, series_uid, stamp
+from service.dicom_out.source import tidy_patient
+from sr_engine.frames import whole
+from sr_engine.reconstruct import Reconstruction
+from sr_engine.shiftset import condition_number, noise_factor
+
+
+def has_image(finding: Finding) -> bool:
+    return bool(finding.result.get("reconstruction"))
+
+
+def image_of(finding: Finding) -> Dataset:
+    """The derived MR image; raises OutputError where the measurement has no reconstruction."""
+    number = finding.measurement.measurement_id
+    if not has_image(finding):
+        raise OutputError(f"measurement {number} has no reconstruction")
+    made = _reconstruction(finding)
+    dataset = derived_image(made, fine_geometry(finding, made.factor), finding.files)
+    tidy_patient(dataset)
+    name = f"measurement-{number}-image"
+    dataset.SOPInstanceUID = output_uid(finding, name)
+    dataset.file_meta.MediaStorageSOPInstanceUID = dataset.SOPInstanceUID
+    words = (str(dataset.StudyInstanceUID), str(dataset.get("FrameOfReferenceUID", "")))
+    dataset.SeriesInstanceUID = series_uid(finding, "image", *words)
+    dataset.InstanceNumber = number
+    stamp(dataset, finding, "image", f"AutoSPINe super-resolution x{made.factor} (research)")
+    return dataset
+
+
+def fine_geometry(finding: Finding, factor: int) -> SliceGeometry:
+    """Of the reconstruction: it covers what its slices cover."""
+    return finding.geometry.finer_grid(factor)
+
+
+def _reconstruction(finding: Finding) -> Reconstruction:
+    """As the worker made it, from the image and the shifts that the record keeps."""
+    image = np.load(finding.case_dir / finding.result["reconstruction"]).astype(np.float64)
+    shape = finding.geometry.shape
+    factor = int(image.shape[0]) // shape[0]
+    shifts_px = finding.shifts_px
+    return Reconstruction(
+        image=image,
+        factor=factor,
+        method="fourier",
+        region=whole(shape),
+        n_frames=len(finding.slices),
+        condition_number=condition_number(shifts_px, factor),
+        noise_factor=noise_factor(shifts_px, factor),
+    )

@@ -1,0 +1,169 @@
+"""The DICOM outputs of a case: each is made once, under a name and UIDs that follow from what it
+is about, and lies in the case's folder from then on.
+
+Who asks a second time, or after a crash, gets the same bytes; and had those been lost, the same
+UIDs: to send an output twice is harmless. `python -m service.dicom_out.make CASE NAME` makes one in
+a process of its own (highdicom takes its time to load, and the control loop needs the interpreter).
+"""
+
+from __future__ import annotations
+
+import io
+import os
+import re
+import sys
+import tempfile
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Literal
+
+from case_record.record import CaseRecord, CaseRecordError
+from service.dicom_out.errors import OutputError
+from service.procedure.registry import APPROACHES
+
+if TYPE_CHECKING:
+    from pydicom.dataset import Dataset
+
+from service.dicom_out.finding import Finding
+
+FOLDER = "outputs"
+Kind = Literal["image", "report", "presentation"]
+Subject = Literal["measurement", "approach", "puncture"]
+_AT_ONCE = 200
+_NAME = re.compile(
+    r"(measurement|approach|puncture)-([1-9][0-9]{0,15})-(image|report|presentation)"
+)
+
+
+@dataclass(frozen=True)
+class Output:
+    """`number` is the id of the measurement, of the approach (its READY), or of the event."""
+
+    subject: Subject
+    number: int
+    kind: Kind
+
+    @property
+    def name(self) -> str:
+        return f"{self.subject}-{self.number}-{self.kind}"
+
+    def path(self, case_dir: Path) -> Path:
+        return case_dir / FOLDER / f"{self.name}.dcm"
+
+
+def output_of(name: str) -> Output:
+    """Raises OutputError for what is no name of an output."""
+    found = _NAME.fullmatch(name)
+    if found is None:
+        raise OutputError(f"{name!r} is no output: SUBJECT-NUMBER-KIND is, as approach-5-report")
+    subject, number, kind = found.groups()
+    return Output(subject, int(number), kind)  # type: ignore[arg-type]
+
+
+def outputs_to_send(record: CaseRecord, after_measurement: int = 0) -> Iterator[Output]:
+    """What is sent unasked: reconstructions, and reports of every READY and puncture."""
+    while rows := record.page_of_measurements(
+        after_id=after_measurement, limit=_AT_ONCE, newest=False
+    ):
+        for row in rows:
+            if (row.result or {}).get("reconstruction"):
+                yield Output("measurement", row.measurement_id, "image")
+        after_measurement = rows[-1].measurement_id
+    for procedure in record.procedures():
+        if procedure.name in APPROACHES and procedure.state == "done":
+            yield Output("approach", procedure.procedure_id, "report")
+            yield Output("approach", procedure.procedure_id, "presentation")
+    for event in record.events_of_kind("puncture"):
+        yield Output("puncture", event.event_id, "report")
+
+
+def make_output(record: CaseRecord, output: Output) -> Path:
+    """Return the file of the output, made now unless it lies there; durable when this returns.
+
+    Raises OutputError, CaseRecordError, OSError.
+    """
+    path = output.path(record.case_dir)
+    if path.is_file():
+        return path
+    buffer = io.BytesIO()
+    try:
+        dataset = dataset_of(_finding(record, output), output)
+        dataset.save_as(buffer, enforce_file_format=True)
+    except OutputError:
+        raise
+    except KeyError as error:
+        raise OutputError(f"{output.name}: the record has no {error}") from error
+    except (AttributeError, TypeError, ValueError) as error:
+        # so highdicom and pydicom say that a source's header cannot be used
+        raise OutputError(f"{output.name}: {error}") from error
+    _write_once(path, buffer.getvalue())
+    return path
+
+
+def dataset_of(finding: Finding, output: Output) -> Dataset:
+    """The DICOM object of an output; the same for the same record."""
+    from service.dicom_out.image import image_of
+
+    if output.kind == "image":
+        return image_of(finding)
+    if output.kind == "presentation":
+        from service.dicom_out.presentation import presentation_of
+
+        return presentation_of(finding)
+    from service.dicom_out.report import report_of
+
+    return report_of(finding)
+
+
+def _finding(record: CaseRecord, output: Output) -> Finding:
+    from service.dicom_out.finding import (
+        finding_of_arrival,
+        finding_of_measurement,
+        finding_of_puncture,
+    )
+
+    find = {
+        "measurement": finding_of_measurement,
+        "approach": finding_of_arrival,
+        "puncture": finding_of_puncture,
+    }[output.subject]
+    return find(record, output.number)
+
+
+def _write_once(path: Path, content: bytes) -> None:
+    """Whoever comes first with a file of this name wins; it is whole and on disk, or not there."""
+    path.parent.mkdir(exist_ok=True)
+    number, part = tempfile.mkstemp(prefix=f"{path.stem}-", suffix=".part", dir=path.parent)
+    try:
+        with os.fdopen(number, "wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        try:
+            os.link(part, path)
+        except FileExistsError:
+            return
+    finally:
+        os.unlink(part)
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:
+        os.fsync(folder)
+    finally:
+        os.close(folder)
+
+
+def main(words: list[str]) -> int:
+    """Make one output; the last line on standard error says why not."""
+    case_dir, name = words
+    try:
+        with CaseRecord(Path(case_dir)) as record:
+            print(make_output(record, output_of(name)))
+    except (OutputError, CaseRecordError, OSError) as error:
+        print(error, file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

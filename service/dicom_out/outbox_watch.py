@@ -1,0 +1,167 @@
+"""The service's side of the outbox: keeps its process alive, and says how the destinations do."""
+
+from __future__ import annotations
+
+import contextlib
+import sqlite3
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Iterable, Iterator, Sequence
+
+import structlog
+from prometheus_client.core import GaugeMetricFamily
+from prometheus_client.registry import Collector
+
+from room_config.load import Config
+from service.dicom_out.outbox_store import STATES, Line, OutboxStore
+from service.room.alarms import Condition
+
+_LOOK_S = 0.5
+_RESTART_S = 1.0
+_LONGEST_RESTART_S = 60.0
+_STABLE_S = 60.0
+_END_S = 5.0
+log = structlog.get_logger()
+
+
+class OutboxWatch(Collector):
+    """`start` it, `close` it. Does nothing at all where no destination is configured."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._names = [one.name for one in config.outputs.destination]
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
+        self._conditions: tuple[Condition, ...] = ()
+        self._lines: dict[str, Line] = {}
+        self._counts: dict[tuple[str, str], int] = {}
+
+    def start(self) -> None:
+        if self._names:
+            self._thread.start()
+
+    def close(self) -> None:
+        self._closing.set()
+        if self._thread.is_alive():
+            self._thread.join(timeout=2 * _END_S)
+
+    def conditions(self) -> Sequence[Condition]:
+        """What is wrong now; as of a moment ago, and never waited for."""
+        return self._conditions
+
+    def collect(self) -> Iterator[GaugeMetricFamily]:
+        outputs = GaugeMetricFamily(
+            "autospine_outbox_outputs", "Outputs by state.", labels=["destination", "state"]
+        )
+        reached = GaugeMetricFamily(
+            "autospine_outbox_reached",
+            "1 unless the last try to reach the destination failed.",
+            labels=["destination"],
+        )
+        for name in self._names:
+            for state in STATES:
+                outputs.add_metric([name, state], self._counts.get((name, state), 0))
+            line = self._lines.get(name)
+            reached.add_metric([name], float(line is None or line.failing_since_s is None))
+        yield outputs
+        yield reached
+
+    # In the watch's own thread
+
+    def _run(self) -> None:
+        child = _Child(self._config)
+        try:
+            while not self._closing.wait(_LOOK_S):
+                child.keep_alive()
+                with contextlib.suppress(sqlite3.Error, OSError):  # looked at again soon
+                    self._look()
+                self._conditions = tuple(self._what_is_wrong(child.problem))
+        finally:
+            child.end()
+
+    def _look(self) -> None:
+        if not self._config.room.case_dir.is_dir():
+            return
+        with OutboxStore(self._config.room.case_dir) as store:
+            self._lines, self._counts = store.lines(), store.counts()
+
+    def _what_is_wrong(self, problem: str) -> Iterable[Condition]:
+        if problem:
+            yield Condition("outbox_lost", "warning", problem, "See the service's log.")
+        for name in self._names:
+            line = self._lines.get(name)
+            since_s = None if line is None else line.failing_since_s
+            if line and since_s and time.time() - since_s > self._config.outputs.alarm_after_s:
+                text = f"Nothing can be sent to {name}: {line.reason}"
+                what = "Check the destination and the network. It is tried again until it works."
+                yield Condition(f"destination_{name}", "warning", text, what)
+            refused = self._counts.get((name, "refused"), 0)
+            if refused:
+                text = f"{name} refused {refused} of our DICOM objects"
+                what = "See the outbox for the reasons. They are sent again now and then."
+                yield Condition(f"refused_{name}", "warning", text, what)
+        if any(self._counts.get((name, "not_made"), 0) for name in self._names):
+            text = "A DICOM object could not be made"
+            what = "See the outbox for the reason."
+            yield Condition("output_not_made", "warning", text, what)
+
+
+class _Child:
+    """The outbox's process; started again when it ends, later and later."""
+
+    def __init__(self, config: Config) -> None:
+        self._config = config
+        self._process: subprocess.Popen[bytes] | None = None
+        self._started_s = 0.0
+        self._wait_s = 0.0
+        self.problem = ""
+
+    def keep_alive(self) -> None:
+        now_s = time.monotonic()
+        if self._process is not None:
+            code = self._process.poll()
+            if code is None:
+                if now_s > self._started_s + _STABLE_S:
+                    self._wait_s, self.problem = 0.0, ""
+                return
+            self._forget()
+            self._wait_s = min(max(_RESTART_S, 2 * self._wait_s), _LONGEST_RESTART_S)
+            self.problem = f"The outbox ended with {code}; it is started again"
+            log.error("the outbox ended", code=code, again_s=self._wait_s)
+            self._started_s = now_s
+        if now_s >= self._started_s + self._wait_s:
+            self._start()
+
+    def _start(self) -> None:
+        self._started_s = time.monotonic()
+        self._process = subprocess.Popen(
+            [sys.executable, "-m", "service.dicom_out.outbox_process"],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.DEVNULL,
+            # a Ctrl-C on the terminal is for the service, which ends the outbox itself
+            start_new_session=True,
+        )
+        assert self._process.stdin is not None
+        with contextlib.suppress(OSError):  # it has ended already: seen at the next look
+            self._process.stdin.write(self._config.model_dump_json().encode() + b"\n")
+            self._process.stdin.flush()
+
+    def _forget(self) -> None:
+        if self._process is not None and self._process.stdin is not None:
+            with contextlib.suppress(OSError):
+                self._process.stdin.close()
+        self._process = None
+
+    def end(self) -> None:
+        """Close its standard input, which ends it, and wait for that."""
+        process = self._process
+        self._forget()
+        if process is None:
+            return
+        try:
+            process.wait(_END_S)
+        except subprocess.TimeoutExpired:
+            process.kill()
+            process.wait()

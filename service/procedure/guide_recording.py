@@ -1,0 +1,94 @@
+"""Recording a needle line: where the guide points, looked at as an approach would at its end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from service.procedure.calibration import Calibration
+from service.procedure.guide_geometry import (
+    GuideGeometry,
+    GuideSeenWrongError,
+    line_of_state,
+    tip_of,
+)
+from service.procedure.guide_looking import GuideLook, look_at_guide, look_at_guide_longer
+from service.procedure.kinematics import Line
+from service.procedure.sensing import ProcedureFailedError, ValidationGate, check_prediction
+from service.procedure.steps import ProcedureSteps
+
+_MOST_FRAMES = 8
+
+
+@dataclass(frozen=True)
+class GuideRecordingArguments:
+    """sigma_mm: how well the tip's place is to be known (worst axis), as far as slices can do it.
+
+    lower_plane_mm: of the lower ball joints along the slice normal.
+    """
+
+    geometry: GuideGeometry
+    lower_plane_mm: float
+    sigma_mm: float
+    gate: ValidationGate
+
+
+@dataclass(frozen=True, eq=False)
+class GuidePlace:
+    """The guide's line now (patient mm), its tip's uncertainty, and what finding it out took."""
+
+    calibration: Calibration
+    line: Line
+    tip_below_joint_mm: float
+    sigma_mm: float
+    frames: int
+    scan_s: float
+
+    @property
+    def tip_mm(self) -> list[float]:
+        return [float(value) for value in self.line.at(-self.tip_below_joint_mm)]
+
+    @property
+    def joint_mm(self) -> list[float]:
+        return [float(value) for value in self.line.point_mm]
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "calibration": self.calibration.to_json(),
+            "measurement_id": self.calibration.measurement_id,
+            "joint_mm": self.joint_mm,
+            "tip_mm": self.tip_mm,
+            "tip_below_joint_mm": self.tip_below_joint_mm,
+            "sigma_mm": self.sigma_mm,
+            "frames": self.frames,
+            "scan_s": self.scan_s,
+        }
+
+
+def record_guide(
+    arguments: GuideRecordingArguments, start: Calibration
+) -> ProcedureSteps[GuidePlace]:
+    """Look at both fiducials where the robot stands, with as many slices as the bound asks for."""
+    prior, geometry = start.estimate, arguments.geometry
+    look = yield from look_at_guide(geometry, prior, arguments.gate, fresh=True)
+    check_prediction(prior, look.found, arguments.gate)
+    wanted = _slices_for(geometry, look, arguments.sigma_mm)
+    if wanted > look.frames_of_each:
+        look = yield from look_at_guide_longer(geometry, look, arguments.gate, frames=wanted)
+    estimate = prior.fused_with(look.found.plane_mm, look.found.covariance_mm2)
+    calibration = replace(start, estimate=estimate, measurement_id=look.measurement_id)
+    try:
+        line = line_of_state(geometry, estimate.plane_mm, start.plane, arguments.lower_plane_mm)
+    except GuideSeenWrongError as wrong:
+        raise ProcedureFailedError("guide", str(wrong)) from wrong
+    sigma_mm = float(np.sqrt(np.trace(tip_of(geometry, estimate)[1]) / 2))
+    return GuidePlace(calibration, line, geometry.tip_beyond_mm, sigma_mm, look.frames, look.scan_s)
+
+
+def _slices_for(geometry: GuideGeometry, look: GuideLook, sigma_mm: float) -> int:
+    """Slices of each fiducial that bring the tip to `sigma_mm` by the bound, and never too many."""
+    frames = look.frames_of_each
+    worst = float(np.linalg.eigvalsh(tip_of(geometry, look.found)[1])[-1])
+    return min(_MOST_FRAMES, max(frames, int(np.ceil(frames * worst / sigma_mm**2))))

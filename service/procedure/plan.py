@@ -1,0 +1,112 @@
+"""From an error in millimetres to absolute setpoints, checked before anybody has to confirm."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from service.procedure.estimate import FiducialEstimate
+from service.procedure.jacobian import ImageJacobian
+
+Array = NDArray[np.float64]
+PLAN_VOID = "plan_void"
+# a readback may differ by so much between two looks at a stage that stands
+SAME_PLACE_UM = 20
+
+
+class PlanRefusedError(Exception):
+    """The move would break a rule; the text names the rule and the numbers."""
+
+
+@dataclass(frozen=True)
+class Travel:
+    """Travel limits of one axis, integer micrometres, both ends allowed."""
+
+    min_um: int
+    max_um: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """A move that was worked out but not made.
+
+    It is void as soon as the robot stands elsewhere than at `from_um`, or a newer measurement than
+    `measurement_id` exists.
+    """
+
+    plan_id: str
+    measurement_id: int
+    from_um: Mapping[str, int]
+    setpoints_um: Mapping[str, int]
+    displacement_mm: tuple[float, float]
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+
+def plan_move(
+    estimate: FiducialEstimate,
+    target_mm: Array,
+    jacobian: ImageJacobian,
+    travel: Mapping[str, Travel],
+    *,
+    measurement_id: int,
+    plan_id: str,
+) -> Plan:
+    """Return the move that brings the fiducial from `estimate` to `target_mm` (image plane).
+
+    Raises PlanRefusedError if an axis would leave its travel, naming axis, setpoint and limits.
+    """
+    displacement = target_mm - estimate.plane_mm
+    change_mm = jacobian.setpoint_change_mm(displacement)
+    setpoints_um = dict(estimate.setpoints_um)
+    for axis, change in change_mm.items():
+        setpoints_um[axis] += round(change * 1000.0)
+    check_travel(setpoints_um, travel)
+    return Plan(
+        plan_id,
+        measurement_id,
+        dict(estimate.setpoints_um),
+        setpoints_um,
+        (float(displacement[0]), float(displacement[1])),
+    )
+
+
+def why_void(
+    from_um: Mapping[str, int],
+    rests_on: int | None,
+    positions_um: Mapping[str, int],
+    newest_measurement_id: int | None,
+) -> str:
+    """Say why a plan may not be carried out any more; empty if it may."""
+    for axis, planned_um in from_um.items():
+        at_um = positions_um.get(axis)
+        if at_um is None or not abs(at_um - planned_um) <= SAME_PLACE_UM:
+            return (
+                f"the plan was made where axis {axis} stood at {planned_um / 1000:.3f} mm, now it "
+                f"stands at {'nowhere known' if at_um is None else f'{at_um / 1000:.3f} mm'}"
+            )
+    newer = rests_on is not None and (newest_measurement_id or 0) > rests_on
+    if newer:
+        return (
+            f"the plan rests on measurement {rests_on}, there is a newer one "
+            f"({newest_measurement_id})"
+        )
+    return ""
+
+
+def check_travel(setpoints_um: Mapping[str, int], travel: Mapping[str, Travel]) -> None:
+    """Raise PlanRefusedError unless every setpoint lies inside the travel of its axis."""
+    for axis, setpoint_um in setpoints_um.items():
+        if axis not in travel:
+            raise PlanRefusedError(f"axis {axis} has no travel limits")
+        limits = travel[axis]
+        if not limits.min_um <= setpoint_um <= limits.max_um:
+            raise PlanRefusedError(
+                f"axis {axis}: setpoint {setpoint_um / 1000:.3f} mm is outside its travel "
+                f"{limits.min_um / 1000:.3f} to {limits.max_um / 1000:.3f} mm"
+            )

@@ -1,0 +1,169 @@
+"""Which procedures there are: from the recorded name and arguments to a generator, and results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import asdict, fields
+from typing import Any
+
+from case_record.record import CaseRecord
+from case_record.rows import Procedure
+from service.procedure.approach import ApproachArguments, Arrival, approach
+from service.procedure.calibration import Calibration, CalibrationArguments, calibrate
+from service.procedure.guide_approach import GuideApproachArguments, GuideArrival, approach_guide
+from service.procedure.guide_calibration import GuideCalibrationArguments, calibrate_guide
+from service.procedure.guide_geometry import GuideGeometry
+from service.procedure.guide_recording import GuidePlace, GuideRecordingArguments, record_guide
+from service.procedure.jog import JogEnd, jog
+from service.procedure.recording import Place, RecordingArguments, record_place
+from service.procedure.sensing import ValidationGate
+from service.procedure.steps import ProcedureSteps
+
+CALIBRATION = "calibration"
+APPROACH = "approach"
+RECORDING = "recording"
+GUIDE_CALIBRATION = "guide_calibration"
+GUIDE_APPROACH = "guide_approach"
+GUIDE_RECORDING = "guide_recording"
+JOG = "jog"
+CALIBRATIONS, APPROACHES = (CALIBRATION, GUIDE_CALIBRATION), (APPROACH, GUIDE_APPROACH)
+
+Arguments = (
+    CalibrationArguments
+    | ApproachArguments
+    | RecordingArguments
+    | GuideCalibrationArguments
+    | GuideApproachArguments
+    | GuideRecordingArguments
+)
+
+
+def build_procedure(row: Procedure) -> ProcedureSteps[Any]:
+    """Return a fresh generator of the recorded procedure; raises KeyError for an unknown name."""
+    return _BUILDERS[row.name](row.arguments)
+
+
+def calibration_arguments(arguments: CalibrationArguments) -> dict[str, Any]:
+    return _recorded(arguments)
+
+
+def approach_arguments(arguments: ApproachArguments, start: Calibration) -> dict[str, Any]:
+    return {"arguments": _recorded(arguments), "start": start.to_json()}
+
+
+def recording_arguments(
+    arguments: RecordingArguments | GuideRecordingArguments, start: Calibration
+) -> dict[str, Any]:
+    return {"arguments": _recorded(arguments), "start": start.to_json()}
+
+
+def guide_calibration_arguments(arguments: GuideCalibrationArguments) -> dict[str, Any]:
+    return _recorded(arguments)
+
+
+def guide_approach_arguments(
+    arguments: GuideApproachArguments, start: Calibration
+) -> dict[str, Any]:
+    return {"arguments": _recorded(arguments), "start": start.to_json()}
+
+
+def _recorded(arguments: Arguments) -> dict[str, Any]:
+    """As the record has them: the validation gate's numbers stand among the others."""
+    values = asdict(arguments)
+    gate: dict[str, Any] = values.pop("gate")
+    return {**values, **gate}
+
+
+def _with_gate(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments again, from what `_recorded` made of them."""
+    values = dict(recorded)
+    gate = ValidationGate(
+        **{field.name: values.pop(field.name) for field in fields(ValidationGate)}
+    )
+    return {**values, "gate": gate}
+
+
+def result_to_json(
+    result: Calibration | Arrival | GuideArrival | Place | GuidePlace | JogEnd,
+) -> dict[str, Any]:
+    return result.to_json()
+
+
+def latest_calibration(record: CaseRecord, *, guide: bool = False) -> Calibration | None:
+    """What the last procedure that came to its end knew; a later calibration replaces it.
+
+    guide: of both fiducials and four axes, else of one and two.
+    """
+    calibration = record.last_procedure(GUIDE_CALIBRATION if guide else CALIBRATION, "done")
+    if calibration is None or calibration.result is None:
+        return None
+    newest = calibration
+    for name in (GUIDE_APPROACH, GUIDE_RECORDING) if guide else (APPROACH, RECORDING):
+        row = record.last_procedure(name, "done")
+        if row is not None and row.result is not None and row.procedure_id > newest.procedure_id:
+            newest = row
+    known = newest.result or {}
+    return Calibration.from_json(known.get("calibration", known))
+
+
+def _build_calibration(value: Mapping[str, Any]) -> ProcedureSteps[Calibration]:
+    first, second = value["axes"]
+    shifts_px = tuple((row, col) for row, col in value["shifts_px"])
+    return calibrate(
+        CalibrationArguments(
+            **{**_with_gate(value), "axes": (first, second), "shifts_px": shifts_px}
+        )
+    )
+
+
+def _build_approach(value: Mapping[str, Any]) -> ProcedureSteps[Arrival]:
+    known = _with_gate(value["arguments"])
+    row, col = known["target_mm"]
+    travel_um = {axis: (low, high) for axis, (low, high) in known["travel_um"].items()}
+    arguments = ApproachArguments(**{**known, "target_mm": (row, col), "travel_um": travel_um})
+    return approach(arguments, Calibration.from_json(value["start"]))
+
+
+def _build_recording(value: Mapping[str, Any]) -> ProcedureSteps[Place]:
+    arguments = RecordingArguments(**_with_gate(value["arguments"]))
+    return record_place(arguments, Calibration.from_json(value["start"]))
+
+
+def _guide_geometry(value: Mapping[str, Any]) -> GuideGeometry:
+    upper_mm, lower_mm = value["slice_positions_mm"]
+    return GuideGeometry(**{**value, "slice_positions_mm": (upper_mm, lower_mm)})
+
+
+def _build_guide_calibration(value: Mapping[str, Any]) -> ProcedureSteps[Calibration]:
+    xt, yt, xb, yb = value["axes"]
+    geometry = _guide_geometry(value["geometry"])
+    return calibrate_guide(
+        GuideCalibrationArguments(
+            **{**_with_gate(value), "axes": (xt, yt, xb, yb), "geometry": geometry}
+        )
+    )
+
+
+def _build_guide_approach(value: Mapping[str, Any]) -> ProcedureSteps[GuideArrival]:
+    known = _with_gate(value["arguments"])
+    known["geometry"] = _guide_geometry(known["geometry"])
+    known["target_mm"] = tuple(known["target_mm"])
+    known["travel_um"] = {axis: (low, high) for axis, (low, high) in known["travel_um"].items()}
+    return approach_guide(GuideApproachArguments(**known), Calibration.from_json(value["start"]))
+
+
+def _build_guide_recording(value: Mapping[str, Any]) -> ProcedureSteps[GuidePlace]:
+    known = _with_gate(value["arguments"])
+    known["geometry"] = _guide_geometry(known["geometry"])
+    return record_guide(GuideRecordingArguments(**known), Calibration.from_json(value["start"]))
+
+
+_BUILDERS: dict[str, Callable[[Mapping[str, Any]], ProcedureSteps[Any]]] = {
+    CALIBRATION: _build_calibration,
+    APPROACH: _build_approach,
+    RECORDING: _build_recording,
+    GUIDE_CALIBRATION: _build_guide_calibration,
+    GUIDE_APPROACH: _build_guide_approach,
+    GUIDE_RECORDING: _build_guide_recording,
+    JOG: lambda value: jog(value["setpoints_um"]),
+}

@@ -1,0 +1,78 @@
+"""From where a procedure starts: what is known of the fiducial, carried to where the robot is."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+
+import numpy as np
+
+from case_record.record import CaseRecord
+from service.procedure.calibration import Calibration
+from service.procedure.estimate import MotionNoise
+
+POSITION_DECLARED = "position_declared"
+# what may have moved the robot unseen, or made its count another one, per axis
+_UNSEEN_MOVE_MM = 5.0
+
+
+def start_point(
+    record: CaseRecord,
+    calibration: Calibration,
+    positions_um: Mapping[str, int],
+    noise: MotionNoise,
+) -> Calibration:
+    """Return the calibration as it holds where the robot stands now.
+
+    If anything happened since its last measurement, the fiducial's place is as good as unknown: a
+    procedure that starts from it looks before it moves.
+    """
+    estimate = calibration.estimate
+    here = dict(positions_um)
+    if dict(estimate.setpoints_um) == here and is_untouched(record, calibration.measurement_id):
+        return calibration
+    moved = estimate.moved_to(here, calibration.jacobian, noise)
+    unseen = np.eye(len(moved.plane_mm)) * _UNSEEN_MOVE_MM**2
+    return replace(
+        calibration, estimate=replace(moved, covariance_mm2=moved.covariance_mm2 + unseen)
+    )
+
+
+def is_untouched(record: CaseRecord, measurement_id: int) -> bool:
+    """True if since this measurement there was no other one, no move, and no declared position.
+
+    A robot that was restarted counts from zero wherever it stands: that its positions are the same
+    numbers as before says nothing then.
+    """
+    newest = record.last_measurement("done")
+    if newest is not None and newest.measurement_id != measurement_id:
+        return False
+    since_s = record.measurement(measurement_id).finished_s
+    if since_s is None:
+        return False
+    declared = record.last_event(POSITION_DECLARED)
+    if declared is not None and declared.wall_s > since_s:
+        return False
+    return all(move.sent_s <= since_s for move in record.moves())
+
+
+def positions_to_declare(record: CaseRecord, positions_um: Mapping[str, int]) -> dict[str, int]:
+    """Where the robot is taken to stand after a restart, per axis: by its count, or by the record.
+
+    Controllers without encoders that were switched off count from zero wherever they stand. Were
+    that taken for the truth, the travel limits would wander with every restart. So where the count
+    is zero and the record knows better, the record is believed; of a move that came to no end, half
+    of it. Either is uncertain: the next procedure looks before it moves.
+    """
+    holds, moves = record.holds(), record.moves()
+    if any(positions_um.values()) or not holds:
+        return dict(positions_um)
+    known = dict(holds[-1].readback_um)
+    last = moves[-1] if moves else None
+    if last is not None and last.ended_s is None and last.sent_s > holds[-1].settled_at_s:
+        if all(setpoint_um == 0 for setpoint_um in last.setpoints_um.values()):
+            return dict(positions_um)  # it may well be there
+        known = {
+            axis: (at_um + last.setpoints_um.get(axis, at_um)) // 2 for axis, at_um in known.items()
+        }
+    return {axis: known.get(axis, at_um) for axis, at_um in positions_um.items()}

@@ -1,0 +1,129 @@
+"""Strategies: how an approach looks at the fiducial, coarsely at first and finely at the end."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from types import MappingProxyType
+
+import numpy as np
+
+from service.procedure.calibration import Calibration
+from service.procedure.estimate import FiducialEstimate
+from service.procedure.plane import ImagePlane
+from service.procedure.sensing import (
+    ProcedureFailedError,
+    ValidationGate,
+    estimate_from,
+    measure_again,
+    measure_here,
+    measure_shift_set,
+)
+from service.procedure.steps import Acquired, Measured, ProcedureSteps
+from sr_engine.shiftset import paper_random
+
+
+@dataclass(frozen=True)
+class Way:
+    """One way to look: the engine's method, the paper's random shift set or one place, and how
+    many pixels of the image looked at make one of the slice's (along an axis)."""
+
+    method: str
+    shifted: bool = False
+    factor: int = 1
+
+
+@dataclass(frozen=True)
+class Strategy:
+    """fuses: measurements and moves are combined, else the last look alone is believed."""
+
+    coarse: Way
+    fine: Way
+    fuses: bool = False
+
+
+_ML, _BASE = Way("ml"), Way("base")
+_BICUBIC, _SR = Way("bicubic", factor=2), Way("sr", shifted=True, factor=2)
+STRATEGIES: Mapping[str, Strategy] = MappingProxyType(
+    {
+        "base": Strategy(_BASE, _BASE),
+        "bicubic": Strategy(_BICUBIC, _BICUBIC),
+        "sr": Strategy(_SR, _SR),
+        "hybrid": Strategy(_BASE, _SR),
+        "adaptive": Strategy(_ML, _ML, fuses=True),
+    }
+)
+
+
+@dataclass(frozen=True, eq=False)
+class Look:
+    """What was seen from where the robot stands now.
+
+    found: from this look alone; prior: what was believed before it; acquired: the hold at which
+    more slices could be taken, None after a shift set.
+    """
+
+    measured: Measured
+    found: FiducialEstimate
+    prior: FiducialEstimate
+    method: str
+    acquired: Acquired | None
+
+    @property
+    def measurement_id(self) -> int:
+        return self.measured.measurement_id
+
+    @property
+    def frames(self) -> int:
+        return self.measured.frames
+
+    @property
+    def scan_s(self) -> float:
+        return self.measured.scan_s
+
+
+def look_at_fiducial(
+    way: Way,
+    calibration: Calibration,
+    gate: ValidationGate,
+    *,
+    seed: tuple[int, int],
+    fresh: bool,
+) -> ProcedureSteps[Look]:
+    """Look in one of the ways; seed: of the shift set, with each look another one."""
+    prior = calibration.estimate
+    expectation = gate.around(prior)
+    if not way.shifted:
+        acquired, measured = yield from measure_here(way.method, expectation, fresh=fresh)
+        _check_plane(measured, calibration.plane)
+        found = estimate_from(measured, prior.setpoints_um)
+        return Look(measured, found, prior, way.method, acquired)
+    shifts_px = paper_random(np.random.default_rng(seed)).shifts_px
+    result = yield from measure_shift_set(
+        prior,
+        shifts_px,
+        calibration.jacobian,
+        calibration.plane,
+        way.method,
+        expectation,
+        gate.noise,
+    )
+    _check_plane(result.measured, calibration.plane)
+    return Look(result.measured, result.estimate, prior, way.method, None)
+
+
+def look_longer(
+    seen: Look, acquired: Acquired, gate: ValidationGate, *, frames: int
+) -> ProcedureSteps[Look]:
+    """Look again with `frames` slices in all from the same hold."""
+    expectation = gate.around(seen.prior)
+    more, measured = yield from measure_again(acquired, seen.method, expectation, frames=frames)
+    found = estimate_from(measured, seen.prior.setpoints_um)
+    return Look(measured, found, seen.prior, seen.method, more)
+
+
+def _check_plane(measured: Measured, plane: ImagePlane) -> None:
+    if not ImagePlane.from_json(measured.plane).is_parallel_to(plane):
+        raise ProcedureFailedError(
+            "plane_changed", "the slice orientation is not that of the calibration"
+        )

@@ -1,0 +1,156 @@
+"""Targets: where the fiducial, or the needle, is to be; set, replaced and withdrawn as events.
+
+A target is either where the fiducial was seen (`in_water` false: the image shows oil, and oil is
+what will be looked at again) or a place in tissue (`in_water` true): then the fiducial must appear
+beside it by the oil-water shift of the slices, which follows from their header.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from case_record.record import CaseRecord
+from case_record.rows import Event
+from service.procedure.guide_geometry import GuideGeometry, state_on_line
+from service.procedure.kinematics import KinematicsError, line_from_entry_and_target
+from service.procedure.plane import ImagePlane
+
+Array = NDArray[np.float64]
+TARGET_SET, TARGET_WITHDRAWN = "target_set", "target_withdrawn"
+ENTRY_SET = "entry_set"
+OIL_WATER_PPM = 3.4
+
+
+class TargetError(ValueError):
+    """The target cannot be used; the text says why and what is missing."""
+
+
+@dataclass(frozen=True)
+class Target:
+    """patient_mm: LPS; `number` is that of the event by which it was set."""
+
+    number: int
+    patient_mm: tuple[float, float, float]
+    label: str = ""
+    in_water: bool = False
+
+
+def current_target(record: CaseRecord) -> Target | None:
+    """The target that was set last, unless it was withdrawn since."""
+    last = record.last_event(TARGET_SET)
+    withdrawn = record.last_event(TARGET_WITHDRAWN)
+    if last is None or (withdrawn is not None and withdrawn.event_id > last.event_id):
+        return None
+    return target_of(last)
+
+
+def current_entry(record: CaseRecord) -> tuple[float, float, float] | None:
+    """The planned skin point that was set last, patient mm (LPS)."""
+    event = record.last_event(ENTRY_SET)
+    if event is None:
+        return None
+    x, y, z = event.body["patient_mm"]
+    return x, y, z
+
+
+def all_targets(record: CaseRecord) -> list[Target]:
+    """Every target of the case in the order in which they were set."""
+    return [target_of(event) for event in record.events_of_kind(TARGET_SET)]
+
+
+def target_of(event: Event) -> Target:
+    x, y, z = event.body["patient_mm"]
+    return Target(
+        event.event_id, (x, y, z), event.body.get("label", ""), event.body.get("in_water", False)
+    )
+
+
+def oil_shift_mm(
+    header: Mapping[str, Any], spacing_mm: tuple[float, float], polarity: int
+) -> Array:
+    """How far oil appears from where it is, (row, col) mm in the image plane.
+
+    header: of a slice as the record keeps it. polarity: +1 if oil appears displaced towards growing
+    indices along the readout, -1 if towards shrinking ones; it is not in any header.
+    Raises TargetError naming the attribute that is missing.
+    """
+    if polarity not in (1, -1):
+        raise TargetError("the readout's polarity must be +1 or -1 (imaging.readout_polarity)")
+    wanted = {
+        "ImagingFrequency": header.get("imaging_frequency_mhz"),
+        "PixelBandwidth": header.get("pixel_bandwidth_hz"),
+    }
+    for name, value in wanted.items():
+        if not isinstance(value, int | float) or not 0 < value < np.inf:
+            raise TargetError(f"the slice has no usable {name}: its oil-water shift is not known")
+    encoding = header.get("phase_encoding_direction")
+    if encoding not in ("ROW", "COL"):
+        raise TargetError(
+            "the slice has no InPlanePhaseEncodingDirection: its oil-water shift is not known"
+        )
+    shift_hz = OIL_WATER_PPM * float(wanted["ImagingFrequency"] or 0.0)
+    shift_px = polarity * shift_hz / float(wanted["PixelBandwidth"] or np.nan)
+    # the phase is encoded along one axis of the image, the readout runs along the other
+    readout = 1 if encoding == "COL" else 0
+    return np.eye(2)[readout] * shift_px * spacing_mm[readout]
+
+
+def fiducial_must_appear_at(
+    target: Target, plane: ImagePlane, header: Mapping[str, Any], polarity: int
+) -> Array:
+    """Where in the image plane, mm (2,), the fiducial is seen when it is at the target."""
+    place = plane.from_patient(target.patient_mm)
+    if not target.in_water:
+        return place
+    return place + oil_shift_mm(header, plane.spacing_mm, polarity)
+
+
+@dataclass(frozen=True, eq=False)
+class NeedleLine:
+    """Where the guide is to be: its line upwards from the lower ball joint, and how deep to go."""
+
+    joint_mm: Array
+    direction: Array
+    depth_mm: float
+
+    def state(
+        self, geometry: GuideGeometry, plane: ImagePlane, oil_shift: Array | None = None
+    ) -> Array:
+        """How it is seen then: (4,), both fiducials in the image plane."""
+        state = state_on_line(geometry, self.joint_mm, self.direction, plane)
+        return state if oil_shift is None else state + np.tile(oil_shift, 2)
+
+
+def needle_line(
+    entry_mm: Sequence[float],
+    target_mm: Sequence[float],
+    plane: ImagePlane,
+    lower_plane_mm: float,
+    upper_plane_mm: float,
+) -> NeedleLine:
+    """The guide's line through entry and target (patient mm), for planes along the slice normal.
+
+    Raises TargetError for points that make no line, one that is too flat, or a target that does not
+    lie below the lower ball joint.
+    """
+    try:
+        line = line_from_entry_and_target(entry_mm, target_mm)
+    except KinematicsError as error:
+        raise TargetError(f"entry and target: {error}") from error
+    along = float(plane.normal @ line.direction)
+    if not abs(along) > 0.5:
+        raise TargetError("the needle would lie flatter than 30° to the slices")
+    direction = line.direction * np.sign(along) * np.sign(upper_plane_mm - lower_plane_mm)
+    depth_mm = (lower_plane_mm - float(plane.normal @ line.point_mm)) / float(
+        plane.normal @ direction
+    )
+    if not depth_mm > 0:
+        raise TargetError(
+            f"the target lies {-depth_mm:.1f} mm above the lower plane: the needle cannot go there"
+        )
+    return NeedleLine(line.point_mm + depth_mm * direction, direction, depth_mm)

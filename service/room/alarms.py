@@ -1,0 +1,65 @@
+"""The alarm list: what is wrong now and since when, and what the listener raised lately."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from case_record.record import CaseRecord
+from service.room.state import AlarmState
+
+_SHOWN_S = 300.0
+_MOST_RAISED = 20
+
+
+@dataclass(frozen=True)
+class Condition:
+    """Something that is wrong for as long as it is reported. severity: `alarm` or `warning`."""
+
+    code: str
+    severity: str
+    text: str
+    what_to_do: str
+
+
+class AlarmBook:
+    """Remembers since when each condition has stood, and reads the record's alarm events once."""
+
+    def __init__(self) -> None:
+        self._since_s: dict[str, float] = {}
+        self._seen_event_id = -1
+        self._raised: list[AlarmState] = []
+
+    def update(self, conditions: Sequence[Condition], record: CaseRecord) -> list[AlarmState]:
+        """Return the alarms of now: standing conditions first, then what was raised lately."""
+        now_s = time.time()
+        self._since_s = {c.code: self._since_s.get(c.code, now_s) for c in conditions}
+        standing = [
+            AlarmState(
+                code=c.code,
+                severity=c.severity,
+                text=c.text,
+                what_to_do=c.what_to_do,
+                since_s=self._since_s[c.code],
+            )
+            for c in conditions
+        ]
+        return [*standing, *self._raised_lately(record, now_s)]
+
+    def _raised_lately(self, record: CaseRecord, now_s: float) -> list[AlarmState]:
+        newest = record.last_event_id()
+        if newest != self._seen_event_id:
+            for event in record.events_of_kind("alarm", after_id=self._seen_event_id):
+                self._raised.append(
+                    AlarmState(
+                        code=str(event.body["alarm"]),
+                        severity="warning",
+                        text=str(event.body["text"]),
+                        what_to_do=f"Raised by the {event.source}.",
+                        since_s=event.wall_s,
+                    )
+                )
+            self._seen_event_id = newest
+        self._raised = [a for a in self._raised if a.since_s > now_s - _SHOWN_S][-_MOST_RAISED:]
+        return self._raised[::-1]

@@ -1,0 +1,59 @@
+"""What the operator (or a program with the operator's rights) may ask of the control loop.
+
+Every command runs in the control loop's thread. What cannot be done now is a `ConflictError` whose
+text says what to do instead; every command that is carried out is an event that names who asked.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import Any
+
+from service.room.commands_procedure import ProcedureCommands
+from service.room.commands_record import RecordCommands
+from service.room.commands_robot import RobotCommands
+from service.room.commands_target import TargetCommands
+from service.room.context import Room
+
+
+class Commands:
+    """Everything that may be asked, by name."""
+
+    def __init__(self, room: Room) -> None:
+        self._robot = RobotCommands(room)
+        self._by_name = {one.__name__: one for one in _all_of(room, self._robot)}
+
+    def carry_out(self, name: str, arguments: Mapping[str, Any]) -> Any:
+        """Carry out a command; raises ConflictError if it cannot be done now."""
+        return self._by_name[name](**arguments)
+
+    def keep_lock(self) -> None:
+        """See RobotCommands.keep_lock: nobody asks for it, it is done all the time."""
+        self._robot.keep_lock()
+
+
+def _all_of(room: Room, robot: RobotCommands) -> tuple[Callable[..., Any], ...]:
+    target, procedure, record = TargetCommands(room), ProcedureCommands(room), RecordCommands(room)
+    return (
+        robot.reset,
+        robot.note_stop,
+        robot.jog,
+        robot.lock_motion,
+        robot.needle_out,
+        target.set_target,
+        target.withdraw_target,
+        target.choose_target,
+        target.record_target,
+        target.set_entry,
+        procedure.start_calibration,
+        procedure.start_approach,
+        procedure.answer,
+        procedure.confirm_acquisition,
+        procedure.abort,
+        procedure.puncture,
+        record.assign_slice,
+        record.give_up_slices,
+        record.describe_case,
+        record.compare_clocks,
+        record.forget_clock,
+    )

@@ -1,0 +1,180 @@
+"""Commands to procedures: begin one, answer its questions, end it, record the puncture."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from room_config.service import GuideConfig
+from service.procedure.fiducial_plan import approach_of, calibration_of
+from service.procedure.guide_plan import guide_approach_of, guide_calibration_of
+from service.procedure.plan import PLAN_VOID, PlanRefusedError
+from service.procedure.registry import (
+    APPROACH,
+    CALIBRATION,
+    GUIDE_APPROACH,
+    GUIDE_CALIBRATION,
+    approach_arguments,
+    calibration_arguments,
+    guide_approach_arguments,
+    guide_calibration_arguments,
+)
+from service.procedure.steering import CONFIRM
+from service.procedure.targets import Target, TargetError, current_entry, current_target
+from service.room.context import Room
+from service.room.readiness import ConflictError, ready_arrival
+
+
+class ProcedureCommands:
+    """Calibration, approach and puncture."""
+
+    def __init__(self, room: Room) -> None:
+        self._room = room
+
+    def start_calibration(self, by: str, guide: bool | None = None) -> int:
+        """Begin a calibration; returns its procedure id. guide: four axes; None: as configured."""
+        self._room.check_may_start()
+        with_guide = self._room.guide_wanted(guide)
+        if with_guide is not None:
+            return self._start_guide_calibration(with_guide, by)
+        try:
+            arguments = calibration_of(self._room.config, self._room.travel(), self._room.seed())
+        except PlanRefusedError as error:
+            raise ConflictError("out_of_travel", f"Calibration: {error}.") from error
+        return self._room.begin(CALIBRATION, calibration_arguments(arguments), by)
+
+    def _start_guide_calibration(self, guide: GuideConfig, by: str) -> int:
+        try:
+            arguments = guide_calibration_of(self._room.config, guide, self._room.travel())
+        except PlanRefusedError as error:
+            raise ConflictError("out_of_travel", f"Calibration: {error}.") from error
+        return self._room.begin(GUIDE_CALIBRATION, guide_calibration_arguments(arguments), by)
+
+    def start_approach(self, by: str, guide: bool | None = None) -> int:
+        """Begin the approach to the target; returns its procedure id.
+
+        guide: with four axes, to the line from entry to target; None: as configured.
+        """
+        self._room.check_may_start()
+        with_guide = self._room.guide_wanted(guide)
+        if with_guide is not None:
+            return self._start_guide_approach(with_guide, by)
+        start = self._room.start_point()
+        target = self._target()
+        try:
+            arguments = approach_of(
+                self._room.config,
+                self._room.link.travel_um,
+                start,
+                target,
+                self._newest_header(),
+                self._room.seed(),
+            )
+        except TargetError as error:
+            raise _unusable(error) from error
+        body = {**approach_arguments(arguments, start), "target": target.number}
+        return self._room.begin(APPROACH, body, by)
+
+    def _start_guide_approach(self, guide: GuideConfig, by: str) -> int:
+        start = self._room.start_point(guide=True)
+        target, entry_mm = self._target(), current_entry(self._room.record)
+        if entry_mm is None:
+            raise ConflictError("no_entry", "Set an entry point first: the needle has a direction.")
+        try:
+            arguments = guide_approach_of(
+                self._room.config,
+                guide,
+                self._room.travel(),
+                start,
+                entry_mm,
+                target,
+                self._newest_header(),
+            )
+        except TargetError as error:
+            raise _unusable(error) from error
+        body = {**guide_approach_arguments(arguments, start), "target": target.number}
+        return self._room.begin(GUIDE_APPROACH, body, by)
+
+    def _target(self) -> Target:
+        target = current_target(self._room.record)
+        if target is None:
+            raise ConflictError("no_target", "Set a target first.")
+        return target
+
+    def _newest_header(self) -> Mapping[str, Any]:
+        newest = self._room.record.last_slice("assigned")
+        return {} if newest is None else newest.header
+
+    def answer(self, question_id: str, choice: str, by: str, plan_id: str | None = None) -> None:
+        """Answer the question that is on the page; void if it is another one by now.
+
+        A confirmed plan must also still rest on where the robot stands and on the newest
+        measurement.
+        """
+        question = self._room.execution.question
+        if self._room.execution.aborting is not None:
+            raise ConflictError(PLAN_VOID, f"Void: {self._room.execution.aborting}.")
+        if question is None or question.question_id != question_id:
+            raise ConflictError("stale_question", self._why_closed())
+        if choice not in question.choices:
+            raise ConflictError("unknown_choice", f"Choose one of {', '.join(question.choices)}.")
+        if choice == CONFIRM and question.plan is not None:
+            self._check_plan(question.plan, plan_id)
+        body = {"question_id": question_id, "choice": choice}
+        self._room.note("answered", by, body if plan_id is None else {**body, "plan_id": plan_id})
+        self._room.execution.answer(choice, by)
+
+    def _why_closed(self) -> str:
+        text = "This question is not open any more."
+        ended = self._room.record.last_ended_procedure()
+        if self._room.record.running_procedure() is not None or ended is None:
+            return text
+        reason = (ended.result or {}).get("reason")
+        return f"{text} The {ended.name} {ended.state}: {reason}." if reason else text
+
+    def _check_plan(self, plan: Mapping[str, Any], plan_id: str | None) -> None:
+        status = self._room.linked()
+        if plan_id is not None and plan_id != plan["plan_id"]:
+            raise ConflictError("stale_plan", "This plan was replaced: read the one shown now.")
+        if status.stopped or not status.armed:
+            raise ConflictError("not_armed", "Re-arm the robot; then start the approach again.")
+        newest = self._room.record.last_measurement()
+        if newest is not None and newest.measurement_id != plan["measurement_id"]:
+            raise ConflictError("stale_plan", "A newer measurement exists: start again.")
+        for axis, planned_from_um in plan["from_um"].items():
+            moved_um = status.positions_um.get(axis, planned_from_um) - planned_from_um
+            if not abs(moved_um) <= self._room.config.service.repeatability_um:
+                raise ConflictError(
+                    "stale_plan",
+                    f"Axis {axis} has moved by {moved_um} µm since this plan was made: "
+                    "end the procedure and start the approach again.",
+                )
+
+    def confirm_acquisition(self, hold_id: int, by: str) -> None:
+        """The operator says that the slices of a hold were acquired (rooms in arrival mode)."""
+        self._room.record.hold(hold_id)
+        self._room.note("acquisition_confirmed", by, {"hold_id": hold_id})
+
+    def abort(self, by: str) -> None:
+        """End the running procedure; the robot stays where it is."""
+        if self._room.record.running_procedure() is None:
+            raise ConflictError("nothing_runs", "No procedure is running.")
+        self._room.note("abort", by, {})
+        self._room.abort(f"ended by {by}")
+
+    def puncture(self, by: str, insertion_depth_mm: float | None = None) -> None:
+        """Record that the puncture was made. Motion stays locked until the needle is out."""
+        arrival = ready_arrival(self._room.record)
+        if arrival is None:
+            raise ConflictError("not_ready", "The needle guide is not at a target (not READY).")
+        body = {
+            "procedure_id": arrival[0],
+            "insertion_depth_mm": insertion_depth_mm,
+            "error_mm": arrival[1]["error_mm"],
+            "sigma_mm": arrival[1]["sigma_mm"],
+        }
+        self._room.note("puncture", by, body)
+
+
+def _unusable(error: TargetError) -> ConflictError:
+    return ConflictError("target_unusable", f"The target cannot be used: {error}.")

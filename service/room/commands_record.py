@@ -1,0 +1,47 @@
+"""What the operator tells the record: slices, clocks, the case."""
+
+from __future__ import annotations
+
+import time
+
+from dicom_listener.overrule import give_up_slices, reassign, reset_clock
+from service.room.context import Room
+from service.room.readiness import ConflictError
+
+
+class RecordCommands:
+    """Decisions and remarks of the operator; nothing moves by them."""
+
+    def __init__(self, room: Room) -> None:
+        self._room = room
+
+    def assign_slice(self, slice_id: int, hold_id: int | None, why: str, by: str) -> None:
+        """Overrule the listener: the slice belongs to this hold, or (None) to none."""
+        row = self._room.record.slice(slice_id)
+        if hold_id is not None:
+            self._room.record.hold(hold_id)
+            if not row.header.get("geometry"):
+                raise ConflictError("no_geometry", f"Slice {slice_id} has no geometry: rescan.")
+        reassign(self._room.record, slice_id, hold_id, by, why or "decided on the page")
+
+    def give_up_slices(self, hold_id: int, why: str, by: str) -> None:
+        """No more slices will come of a hold: the next one need not be scanned again for it."""
+        hold = self._room.record.hold(hold_id)
+        if hold.ended_at_s is None and self._room.record.running_procedure() is not None:
+            raise ConflictError(
+                "busy", f"Hold {hold_id} stands and its slices are asked for: end the procedure."
+            )
+        give_up_slices(self._room.record, hold_id, by, why)
+
+    def describe_case(self, by: str, **words: str) -> None:
+        """Write down what the operator says about the case."""
+        self._room.note("case_described", by, dict(words))
+
+    def compare_clocks(self, by: str, offset_s: float, uncertainty_s: float) -> None:
+        """The room's clock minus the scanner's, compared just now; the listener heeds the event."""
+        body = {"offset_s": offset_s, "uncertainty_s": uncertainty_s, "at_s": time.time()}
+        self._room.note("clock_sync", by, body)
+
+    def forget_clock(self, why: str, by: str) -> None:
+        """The scanner's clock was set, or seemed to be: the next slices show it anew."""
+        reset_clock(self._room.record, by, why)

@@ -1,0 +1,92 @@
+"""Commands to the robot: stop, re-arm, jog, and the insertion lock."""
+
+from __future__ import annotations
+
+from robot_bridge.client.client import BridgeError
+from service.procedure.plan import PlanRefusedError, check_travel
+from service.procedure.registry import JOG
+from service.procedure.start_point import POSITION_DECLARED, positions_to_declare
+from service.room.context import SOURCE, Room
+from service.room.readiness import ConflictError, ready_arrival
+
+
+class RobotCommands:
+    """What may be asked of the robot itself."""
+
+    def __init__(self, room: Room) -> None:
+        self._room = room
+
+    def reset(self, by: str) -> None:
+        """Clear a latched stop, take the positions as they stand or are recorded, and arm."""
+        status = self._room.linked()
+        try:
+            if not status.position_certain:
+                positions_um = positions_to_declare(self._room.record, status.positions_um)
+                self._room.link.client.declare_position(positions_um, by)
+                counted_um = dict(status.positions_um)
+                body = {"positions_um": positions_um, "counted_um": counted_um}
+                self._room.note(POSITION_DECLARED, by, body)
+            if status.stopped:
+                self._room.link.client.rearm(by)
+            elif not status.armed:
+                self._room.link.client.arm(by)
+        except BridgeError as error:
+            raise ConflictError("robot_refused", str(error)) from error
+        self._room.note("armed", by, {})
+
+    def note_stop(self, by: str, emergency: bool) -> None:
+        """STOP was sent already: record it and end the procedure."""
+        self._room.note("emergency" if emergency else "stop", by, {})
+        self._room.abort(f"STOP by {by}")
+
+    def jog(self, axis: str, distance_um: int, by: str) -> int:
+        """Move one axis by hand; returns the id of the procedure that does it."""
+        self._room.check_may_start()
+        status = self._room.linked()
+        travel = self._room.travel()
+        if axis not in travel or axis not in status.positions_um:
+            raise ConflictError("unknown_axis", f"The robot has no axis {axis!r}.")
+        if not status.position_certain:
+            raise ConflictError("position_uncertain", "Check the robot's position and re-arm.")
+        setpoint_um = status.positions_um[axis] + distance_um
+        try:
+            check_travel({axis: setpoint_um}, travel)
+        except PlanRefusedError as error:
+            raise ConflictError("out_of_travel", f"Not moved: {error}.") from error
+        setpoints_um = {**status.positions_um, axis: setpoint_um}
+        return self._room.begin(JOG, {"setpoints_um": setpoints_um}, by)
+
+    def lock_motion(self, by: str) -> None:
+        """The needle is going in: no motion until the operator says that it is out."""
+        self._room.linked()
+        if self._room.record.running_procedure() is not None:
+            raise ConflictError("busy", "A procedure is running: end it before locking motion.")
+        try:
+            self._room.link.client.set_insertion_lock(True, by)
+        except BridgeError as error:
+            raise ConflictError("robot_refused", str(error)) from error
+        self._room.note("insertion_locked", by, {})
+
+    def needle_out(self, by: str) -> None:
+        """The needle is out: unlock motion."""
+        status = self._room.linked()
+        self._room.note("needle_out", by, {})
+        if not status.insertion_locked:
+            return
+        try:
+            self._room.link.client.set_insertion_lock(False, by)
+        except BridgeError as error:
+            raise ConflictError("robot_refused", str(error)) from error
+
+    def keep_lock(self) -> None:
+        """Hold the insertion lock from READY until the operator says that the needle is out."""
+        status = self._room.link.status
+        if status is None or status.insertion_locked or status.moving:
+            return
+        if ready_arrival(self._room.record) is None:
+            return
+        try:
+            self._room.link.client.set_insertion_lock(True, SOURCE)
+        except BridgeError:
+            return  # asked again at the next tick; until then `may_start` refuses every motion
+        self._room.note("insertion_locked", SOURCE, {})

@@ -1,0 +1,90 @@
+"""Commands that say where the needle is to go: target and entry point."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+from service.procedure.fiducial_plan import recording_of
+from service.procedure.guide_plan import guide_recording_of
+from service.procedure.registry import APPROACHES, GUIDE_RECORDING, RECORDING, recording_arguments
+from service.procedure.targets import (
+    ENTRY_SET,
+    TARGET_SET,
+    TARGET_WITHDRAWN,
+    all_targets,
+    current_target,
+)
+from service.room.context import Room
+from service.room.readiness import ConflictError
+
+
+class TargetCommands:
+    """Target and entry point; a plan that waits for confirmation is void when they change."""
+
+    def __init__(self, room: Room) -> None:
+        self._room = room
+
+    def set_target(
+        self, patient_mm: Sequence[float], by: str, label: str = "", in_water: bool = False
+    ) -> None:
+        """Set where the fiducial is to be, in patient mm (LPS); in_water: a place in tissue."""
+        if len(patient_mm) != 3 or not all(math.isfinite(value) for value in patient_mm):
+            raise ConflictError("bad_target", "A target is three finite numbers, patient mm.")
+        self._void_plan_for(by, "target was changed")
+        body = {"patient_mm": [float(value) for value in patient_mm]}
+        self._room.note(TARGET_SET, by, {**body, "label": label, "in_water": in_water})
+
+    def withdraw_target(self, by: str) -> None:
+        """There is no target any more until another one is set."""
+        if current_target(self._room.record) is None:
+            raise ConflictError("no_target", "There is no target to withdraw.")
+        self._void_plan_for(by, "target was withdrawn")
+        self._room.note(TARGET_WITHDRAWN, by, {})
+
+    def choose_target(self, number: int, by: str) -> None:
+        """Take a target of this case again, by its number."""
+        known = next((t for t in all_targets(self._room.record) if t.number == number), None)
+        if known is None:
+            raise ConflictError("no_target", f"This case has no target number {number}.")
+        self._void_plan_for(by, "target was changed")
+        body = {"patient_mm": list(known.patient_mm), "label": known.label}
+        self._room.note(TARGET_SET, by, {**body, "in_water": known.in_water, "again": number})
+
+    def record_target(self, by: str, label: str = "") -> int:
+        """Begin to find out where the fiducial is now: that place becomes the target.
+
+        With two fiducials the needle's line does: entry point and target.
+        """
+        self._room.check_may_start()
+        guide = self._room.guide_wanted(None)
+        if guide is not None:
+            start = self._room.start_point(guide=True)
+            told = recording_arguments(guide_recording_of(self._room.config, guide), start)
+            return self._room.begin(GUIDE_RECORDING, {**told, "label": label, "by": by}, by)
+        arguments = recording_of(self._room.config, self._room.seed())
+        start = self._room.start_point()
+        body = {**recording_arguments(arguments, start), "label": label, "by": by}
+        return self._room.begin(RECORDING, body, by)
+
+    def set_entry(self, patient_mm: Sequence[float], by: str) -> None:
+        """Set the planned skin point, patient mm (LPS)."""
+        if self._room.config.service.guide is not None:
+            self._void_plan_for(by, "entry point was changed")
+        self._room.note(ENTRY_SET, by, {"patient_mm": [float(value) for value in patient_mm]})
+
+    def _void_plan_for(self, by: str, what: str) -> None:
+        """Before a target changes: void the plan that waits for confirmation; refuse if busy."""
+        running = self._room.record.running_procedure()
+        if running is None:
+            return
+        question = self._room.execution.question
+        if running.name not in APPROACHES or question is None or question.plan is None:
+            raise ConflictError("busy", "Abort the running procedure before changing the target.")
+        reason = (
+            f"the {what} by {by} while a move waited for confirmation: the move is not made, "
+            "start the approach again"
+        )
+        body = {"plan_id": question.plan["plan_id"], "reason": reason}
+        self._room.note("plan_void", by, body)
+        self._room.abort(reason)

@@ -1,0 +1,42 @@
+"""What is wrong in the room now, and what to do about it."""
+
+from __future__ import annotations
+
+from robot_bridge.protocol.phases import WorkPhase
+from service.room.alarms import Condition
+from service.room.prompt import plain_words
+from service.room.state import RoomState
+
+
+def conditions(state: RoomState) -> list[Condition]:
+    """What is wrong now, most urgent first; each with what to do about it."""
+    robot = state.robot
+    found = []
+    if not robot.linked:
+        found.append(
+            Condition(
+                "no_link", "alarm", f"No link to the robot: {robot.problem}", "Check the line."
+            )
+        )
+    if robot.linked and robot.fault:
+        found.append(Condition("fault", "alarm", f"Motor fault: {robot.fault}", "See the motors."))
+    if robot.linked and robot.phase == WorkPhase.EMERGENCY:
+        text = f"EMERGENCY ({plain_words(robot.stop_reason)}): the drives are parked"
+        what = "See to patient and needle. Re-arm when it is safe, then measure again."
+        found.append(Condition("emergency", "alarm", text, what))
+    elif robot.linked and robot.stopped:
+        text = f"The robot is stopped ({plain_words(robot.stop_reason)})"
+        found.append(Condition("stopped", "alarm", text, "Re-arm when it is safe."))
+    if robot.linked and not robot.position_certain:
+        text = "The robot's position is not certain"
+        found.append(Condition("position", "warning", text, "Re-arm, then measure."))
+    for process in state.processes:
+        if process.condition in ("down", "old"):
+            text = f"The {process.name} {process.detail}"
+            found.append(
+                Condition(f"{process.name}_lost", "alarm", text, f"Start the {process.name} again.")
+            )
+    if state.measurement is not None and state.measurement.state == "failed":
+        text = f"Measurement failed: {state.measurement.reason}"
+        found.append(Condition("measurement", "warning", text, "Rescan."))
+    return found

@@ -1,0 +1,236 @@
+"""From the record, the link and the running procedure to the one value that a screen shows."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from typing import Any
+
+from case_record.presence import who_is_alive
+from case_record.record import CaseRecord
+from case_record.rows import Measurement, SliceRow
+from room_config.load import Config
+from service.procedure.targets import current_entry, current_target
+from service.room.alarms import AlarmBook, Condition
+from service.room.conditions import conditions
+from service.room.describe_measurement import (
+    describe_error,
+    describe_measurement,
+    describe_other_fiducial,
+    describe_reconstruction,
+)
+from service.room.execution import Execution
+from service.room.link import RoomLink
+from service.room.prompt import is_calibrated, outcome_text, prompt
+from service.room.readiness import may_start, ready_arrival
+from service.room.state import (
+    AcquisitionState,
+    ArrivalState,
+    CaseState,
+    ClockState,
+    HoldState,
+    ProcessState,
+    QuestionState,
+    RobotState,
+    RoomState,
+    SliceState,
+)
+
+PROCESSES = ("listener", "worker")
+_BEAT_IS_OLD_S = 3.0
+_LOOK_EVERY_S = 0.25
+
+
+class Describer:
+    """Makes the state anew when asked; keeps only what is dear to find out again."""
+
+    def __init__(
+        self,
+        config: Config,
+        record: CaseRecord,
+        link: RoomLink,
+        others_wrong: Callable[[], Sequence[Condition]] = tuple,
+    ) -> None:
+        self._others_wrong = others_wrong
+        self._config = config
+        self._record = record
+        self._link = link
+        self._alarms = AlarmBook()
+        self._processes: list[ProcessState] = []
+        self._look_at_s = 0.0
+        self._around_id = 0
+
+    def describe(self, execution: Execution, before: RoomState) -> RoomState:
+        """Return the present state; the revision grows only if something else than time changed."""
+        config, record, link = self._config, self._record, self._link
+        case = record.case()
+        target = current_target(record)
+        target_mm = list(target.patient_mm) if target else None
+        measurement = record.last_measurement()
+        arrival = _arrival(record)
+        state = before.model_copy(
+            update={
+                "at_s": time.time(),
+                "case_uid": case.case_uid if case else "",
+                "case": _case(record),
+                **_procedures(record, execution),
+                "prompt": prompt(config, record, link, execution, arrival is not None),
+                "ready": arrival is not None,
+                "arrival": arrival,
+                "punctured": arrival is not None and _punctured(record, arrival.procedure_id),
+                "robot": _robot(link, before.robot),
+                "jog_possible": may_start(record, link.status) is None,
+                "hold": _hold(record),
+                **_slices(record),
+                "measurement": None if measurement is None else describe_measurement(measurement),
+                **self._around(measurement, before),
+                "clock": _clock(config, record),
+                "calibrated": is_calibrated(config, record),
+                "target_patient_mm": tuple(target_mm) if target_mm else None,
+                "entry_patient_mm": current_entry(record),
+                "error": describe_error(config, record, target_mm),
+                "event_id": record.last_event_id(),
+                "processes": self._look_at_processes(),
+            }
+        )
+        alarms = self._alarms.update([*conditions(state), *self._others_wrong()], record)
+        state = state.model_copy(update={"alarms": alarms})
+        same = state.model_copy(update={"at_s": before.at_s}) == before
+        return state.model_copy(update={"revision": before.revision + (not same)})
+
+    def _around(self, last: Measurement | None, before: RoomState) -> dict[str, Any]:
+        """What goes with the newest measurement; looked up once for each."""
+        if last is None or last.measurement_id == self._around_id:
+            return {}
+        self._around_id = last.measurement_id
+        return {
+            "reconstruction": describe_reconstruction(self._record, before.reconstruction, last),
+            "other_fiducial": describe_other_fiducial(self._record, last),
+        }
+
+    def _look_at_processes(self) -> list[ProcessState]:
+        if time.monotonic() >= self._look_at_s:
+            self._look_at_s = time.monotonic() + _LOOK_EVERY_S
+            self._processes = [
+                ProcessState(name=p.name, **_condition(p.seen, p.running, p.beat_age_s))
+                for p in who_is_alive(self._config.room.case_dir, PROCESSES)
+            ]
+        return self._processes
+
+
+def _condition(seen: bool, running: bool, beat_age_s: float) -> dict[str, str]:
+    if not seen:
+        return {"condition": "none", "detail": "has not run on this case yet"}
+    if not running:
+        return {"condition": "down", "detail": "has ended"}
+    if beat_age_s > _BEAT_IS_OLD_S:
+        return {"condition": "old", "detail": "does not get on"}
+    return {"condition": "up", "detail": ""}
+
+
+def _robot(link: RoomLink, before: RobotState) -> RobotState:
+    status = link.status
+    if status is None:
+        return before.model_copy(update={"linked": False, "problem": link.problem})
+    return RobotState(
+        linked=True,
+        problem="",
+        phase=str(status.phase),
+        armed=status.armed,
+        stopped=status.stopped,
+        stop_reason=status.stop_reason,
+        insertion_locked=status.insertion_locked,
+        moving=status.moving,
+        position_certain=status.position_certain,
+        positions_um=dict(status.positions_um),
+        travel_um=link.travel_um,
+        fault=status.fault,
+        boot_id=status.boot_id,
+    )
+
+
+def _procedures(record: CaseRecord, execution: Execution) -> dict[str, Any]:
+    """The one that runs, what it asks for, and how the last one ended."""
+    running, ended = record.running_procedure(), record.last_ended_procedure()
+    request, question = execution.request, execution.question
+    return {
+        "procedure": running.name if running else None,
+        "procedure_id": running.procedure_id if running else None,
+        "last_outcome": outcome_text(ended.name, ended.state, ended.result) if ended else "",
+        "acquisition_request": AcquisitionState(**vars(request)) if request else None,
+        "question": QuestionState(**{**vars(question), "choices": list(question.choices)})
+        if question
+        else None,
+    }
+
+
+def _case(record: CaseRecord) -> CaseState | None:
+    described = record.last_event("case_described")
+    return CaseState(**described.body) if described else None
+
+
+def _hold(record: CaseRecord) -> HoldState | None:
+    hold = record.open_hold()
+    if hold is None:
+        return None
+    return HoldState(hold_id=hold.hold_id, set_id=hold.set_id, settled_at_s=hold.settled_at_s)
+
+
+def _slices(record: CaseRecord) -> dict[str, Any]:
+    """How many there are, the last one, and the one that is shown."""
+    last = record.last_slice()
+    shown = record.last_slice("assigned") or last
+    return {
+        "last_slice_id": last.slice_id if last else None,
+        "last_slice_received_s": last.received_s if last else None,
+        "slices": record.count_slices(),
+        "slice": _slice(shown) if shown else None,
+    }
+
+
+def _slice(row: SliceRow) -> SliceState | None:
+    geometry = row.header.get("geometry")
+    if not geometry:
+        return None
+    return SliceState(
+        slice_id=row.slice_id,
+        state=row.state,
+        received_s=row.received_s,
+        acquired_to_s=row.acquired_to_s,
+        time_source=row.time_source,
+        **geometry,
+    )
+
+
+def _arrival(record: CaseRecord) -> ArrivalState | None:
+    """Of the approach whose target the needle guide is at."""
+    arrival = ready_arrival(record)
+    if arrival is None:
+        return None
+    procedure_id, result = arrival
+    known = {name: result[name] for name in ArrivalState.model_fields if name in result}
+    return ArrivalState(procedure_id=procedure_id, **known)
+
+
+def _punctured(record: CaseRecord, procedure_id: int) -> bool:
+    puncture = record.last_event("puncture")
+    return puncture is not None and puncture.body["procedure_id"] == procedure_id
+
+
+def _clock(config: Config, record: CaseRecord) -> ClockState | None:
+    compared = record.last_event("clock_sync")
+    forgotten = record.last_event("clock_reset")
+    listener = config.listener
+    if forgotten is not None and (compared is None or compared.event_id < forgotten.event_id):
+        return None
+    if compared is not None:
+        offset_s, uncertainty_s = (compared.body[k] for k in ("offset_s", "uncertainty_s"))
+        return ClockState(
+            offset_s=offset_s,
+            uncertainty_s=uncertainty_s,
+            compared_s=compared.wall_s,
+            who=compared.who,
+        )
+    if listener.clock_offset_s is None:
+        return None
+    return ClockState(offset_s=listener.clock_offset_s, uncertainty_s=listener.clock_uncertainty_s)

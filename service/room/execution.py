@@ -1,0 +1,318 @@
+"""Carries out the steps of a procedure: moves the robot, waits for slices, asks the operator."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from case_record.record import CaseRecord
+from case_record.rows import Hold
+from robot_bridge.client.client import LinkLostError, MoveOutcome, RefusedError
+from robot_bridge.protocol.messages import CommandState
+from robot_bridge.protocol.phases import WorkPhase, motion_allowed
+from room_config.load import Config
+from service.procedure.plan import PLAN_VOID, why_void
+from service.procedure.steps import (
+    Acquire,
+    Acquired,
+    Answered,
+    AskOperator,
+    Measure,
+    Measured,
+    Moved,
+    MoveTo,
+    Outcome,
+    Step,
+)
+from service.room.link import RoomLink
+from service.room.measuring import measure_request, measured_from_result
+from sr_engine.worker import is_at_position
+
+_SERVICE = "service"
+
+
+def _phase_of(purpose: str) -> WorkPhase:
+    if "calib" in purpose:
+        return WorkPhase.CALIBRATION
+    return WorkPhase.MANUAL if purpose == "manual" else WorkPhase.MOVE_TO_TARGET
+
+
+class ProcedureAbortedError(Exception):
+    """The operator ended the procedure, or STOP did. The robot stands still."""
+
+
+@dataclass(frozen=True)
+class AcquisitionRequest:
+    """What the scanner operator is asked to acquire now."""
+
+    request_id: str
+    hold_id: int
+    count: int
+    slice_position_mm: float | None = None
+
+
+@dataclass(frozen=True)
+class Question:
+    """What the operator is asked; an answer must name `question_id`."""
+
+    question_id: str
+    question: str
+    choices: tuple[str, ...]
+    plan: Mapping[str, Any] | None
+
+
+class Execution:
+    """Executes one step at a time; between looks at the record it lets the control loop tick."""
+
+    def __init__(
+        self, config: Config, record: CaseRecord, link: RoomLink, tick: Callable[[], None]
+    ) -> None:
+        self._config = config
+        self._record = record
+        self._link = link
+        self._tick = tick
+        self._answer: Answered | None = None
+        self._abort: str | None = None
+        self.request: AcquisitionRequest | None = None
+        self.question: Question | None = None
+        self.prompt = ""
+
+    def execute(self, step: Step, command_id: str) -> Outcome:
+        """Carry out a step; raises ProcedureAbortedError when the operator or STOP ends it."""
+        self._check_abort()
+        if isinstance(step, MoveTo):
+            return self._move(step, command_id)
+        if isinstance(step, Acquire):
+            return self._acquire(step)
+        if isinstance(step, Measure):
+            return self._measure(step)
+        return self._ask(step, command_id)
+
+    def answer(self, choice: str, who: str) -> None:
+        self._answer = Answered(choice, who)
+        self.question = None  # at once: nobody sees or answers it a second time
+
+    def abort(self, reason: str) -> None:
+        """End the running procedure at its next look; nothing if none runs."""
+        self._abort = reason
+
+    @property
+    def aborting(self) -> str | None:
+        """Why the running procedure is about to end, if it is."""
+        return self._abort
+
+    def clear(self) -> None:
+        self._answer = self._abort = self.request = self.question = None
+        self.prompt = ""
+
+    # Moves
+
+    def _move(self, step: MoveTo, command_id: str) -> Moved:
+        phase = _phase_of(step.purpose)
+        measurement = None if step.rests_on is None else str(step.rests_on)
+        while True:
+            self._wait_until_ready_to_move()
+            void = self._why_void(step, command_id)
+            if void:
+                return self._refuse(void)
+            with self._record.transaction():
+                self._record.end_open_hold(time.time())
+                self._record.send_move(
+                    command_id,
+                    setpoints_um=step.setpoints_um,
+                    measurement_id=step.rests_on,
+                    purpose=step.purpose,
+                )
+                self._record.append_event(
+                    "move_sent",
+                    {"command_id": command_id, "setpoints_um": dict(step.setpoints_um)},
+                    source=_SERVICE,
+                )
+            self.prompt = f"The robot moves ({step.purpose})."
+            try:
+                if not self._stands_in_motion_phase(phase):
+                    self._link.enter_phase(phase, _SERVICE)
+                outcome = self._link.client.move(command_id, step.setpoints_um, measurement)
+            except LinkLostError as error:
+                self._link.lost(error)
+                continue  # asked again under the same id: the bridge's journal answers
+            except RefusedError as error:
+                outcome = MoveOutcome(command_id, CommandState.REFUSED, error.code, error.text, {})
+            return self._settled(step, outcome)
+
+    def _why_void(self, step: MoveTo, command_id: str) -> str:
+        """Why the plan behind a move is void; a move that was sent is only asked for again."""
+        status = self._link.status
+        if step.from_um is None or status is None or self._record.has_move(command_id):
+            return ""
+        newest = self._record.last_measurement("done")
+        newest_id = None if newest is None else newest.measurement_id
+        return why_void(step.from_um, step.rests_on, status.positions_um, newest_id)
+
+    def _refuse(self, reason: str) -> Moved:
+        hold = self._hold_to_image(fresh=False)
+        self._record.append_event("plan_void", {"reason": reason}, source=_SERVICE)
+        return Moved("REFUSED", PLAN_VOID, reason, hold.hold_id, hold.readback_um)
+
+    def _stands_in_motion_phase(self, wanted: WorkPhase) -> bool:
+        status = self._link.status
+        return status is not None and status.phase == wanted and motion_allowed(status.phase)
+
+    def _settled(self, step: MoveTo, outcome: MoveOutcome) -> Moved:
+        settled_at_s = time.time()
+        readback_um = dict(outcome.readback_um)
+        status = self._link.status
+        if not readback_um and status is not None:
+            readback_um = dict(status.positions_um)
+        with self._record.transaction():
+            self._record.end_move(
+                outcome.command_id, outcome.state, outcome.code, outcome.text, readback_um
+            )
+            self._record.append_event(
+                "move_ended",
+                {
+                    "command_id": outcome.command_id,
+                    "state": str(outcome.state),
+                    "code": outcome.code,
+                    "readback_um": readback_um,
+                },
+                source=_SERVICE,
+            )
+            hold = self._begin_hold(step, readback_um, settled_at_s)
+        self._check_abort()
+        return Moved(str(outcome.state), outcome.code, outcome.text, hold.hold_id, hold.readback_um)
+
+    def _begin_hold(
+        self, step: MoveTo | None, readback_um: Mapping[str, int], settled_at_s: float
+    ) -> Hold:
+        next_set = self._record.next_set_id()
+        in_set = step is not None and not step.new_set
+        return self._record.begin_hold(
+            set_id=next_set - 1 if in_set else next_set,
+            place=step.place if step else 0,
+            setpoints_um=step.setpoints_um if step else readback_um,
+            readback_um=readback_um,
+            shift_um=step.shift_um if step else {},
+            shift_px=step.shift_px if step else (0.0, 0.0),
+            settled_at_s=settled_at_s,
+        )
+
+    def _wait_until_ready_to_move(self) -> None:
+        while True:
+            status = self._link.status
+            if status is None:
+                self.prompt = f"No link to the robot: {self._link.problem}"
+            elif status.moving:
+                self.prompt = "The robot is coming to rest."
+            elif status.stopped or not status.armed:
+                self.prompt = "Re-arm the robot to go on."
+            elif not status.position_certain:
+                self.prompt = "The robot was restarted: check it, then re-arm to go on."
+            else:
+                return
+            self._wait()
+
+    # Slices and measurements
+
+    def _acquire(self, step: Acquire) -> Acquired:
+        hold = self._hold_to_image(fresh=step.fresh)
+        self._expect(hold, step)
+        self._let_clocks_agree(hold)
+        attempt = 0
+        while True:
+            missing = step.count - self._assigned(hold, step.slice_position_mm)
+            if missing <= 0:
+                break
+            self._expect(hold, step)
+            where = "" if step.slice_position_mm is None else f"@{step.slice_position_mm:.1f}"
+            self.request = AcquisitionRequest(
+                f"{hold.hold_id}.{step.count}{where}.{attempt}",
+                hold.hold_id,
+                missing,
+                step.slice_position_mm,
+            )
+            again = " again" if attempt else ""
+            at = "" if not where else f" at {step.slice_position_mm:.1f} mm"
+            self.prompt = f"Acquire {missing} coronal slice{'s' * (missing > 1)}{at}{again}."
+            self._wait_for_slices(hold, missing, step.slice_position_mm)
+            attempt += 1
+        self.request = None
+        return Acquired(hold.hold_id, step.count)
+
+    def _expect(self, hold: Hold, step: Acquire) -> None:
+        """Tell the listener how many slices the hold has in all: those elsewhere come on top."""
+        elsewhere = self._assigned(hold, None) - self._assigned(hold, step.slice_position_mm)
+        self._record.expect_slices(hold.hold_id, step.count + elsewhere)
+
+    def _let_clocks_agree(self, hold: Hold) -> None:
+        """Ask for slices only when the hold is older than the scanner's clock is uncertain."""
+        while time.time() < hold.settled_at_s + self._config.service.settle_s:
+            self.prompt = "Standing still before the next slice."
+            self._wait()
+
+    def _assigned(self, hold: Hold, slice_position_mm: float | None) -> int:
+        rows = self._record.slices(hold_id=hold.hold_id, state="assigned")
+        return sum(is_at_position(row, slice_position_mm) for row in rows)
+
+    def _wait_for_slices(self, hold: Hold, missing: int, slice_position_mm: float | None) -> None:
+        """Until the slices are there, or as many came but were set aside, or none for too long."""
+        last = self._record.last_slice()
+        last_id = last.slice_id if last else 0
+        wanted = self._assigned(hold, slice_position_mm) + missing
+        deadline_s = time.monotonic() + self._config.service.rescan_after_s
+        while time.monotonic() < deadline_s:
+            assigned = self._assigned(hold, slice_position_mm)
+            aside = self._record.count_slices_after(last_id, "quarantined")
+            if assigned >= wanted or (aside and assigned + aside >= wanted):
+                return
+            self._wait()
+
+    def _hold_to_image(self, *, fresh: bool) -> Hold:
+        """The open hold; a new one where the robot stands if asked for, or after a restart."""
+        while True:
+            hold = self._record.open_hold()
+            status = self._link.status
+            if status is not None and not status.moving and status.position_certain:
+                stands = hold is not None and hold.readback_um == dict(status.positions_um)
+                if hold is not None and stands and not fresh:
+                    return hold
+                with self._record.transaction():
+                    self._record.end_open_hold(time.time())
+                    return self._begin_hold(None, dict(status.positions_um), time.time())
+            self.prompt = "The robot's position is not certain: check it, then re-arm to go on."
+            self._wait()
+
+    def _measure(self, step: Measure) -> Measured:
+        imaging = self._config.imaging
+        radius_mm = (imaging.fiducial_radius_min_mm, imaging.fiducial_radius_max_mm)
+        hold_ids = [h.hold_id for h in step.holds]
+        request = measure_request(step, radius_mm, imaging.start_region_px)
+        number = self._record.request_measurement(step.method, hold_ids, request)
+        self.prompt = "Localizing the fiducial."
+        while (measurement := self._record.measurement(number)).state == "requested":
+            self._wait()
+        if measurement.state == "failed" or measurement.result is None:
+            return Measured(number, measurement.reason_code or "failed", measurement.reason)
+        return measured_from_result(number, measurement.result)
+
+    # The operator
+
+    def _ask(self, step: AskOperator, question_id: str) -> Answered:
+        self._answer = None
+        self.question = Question(question_id, step.question, step.choices, step.plan)
+        self.prompt = step.question
+        while self._answer is None:
+            self._wait()
+        self.question = None
+        return self._answer
+
+    def _wait(self) -> None:
+        self._tick()
+        self._check_abort()
+
+    def _check_abort(self) -> None:
+        if self._abort is not None:
+            reason, self._abort = self._abort, None
+            raise ProcedureAbortedError(reason)

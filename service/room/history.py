@@ -1,0 +1,137 @@
+"""Looking back: errors to the targets of their time, and the cases beside this one."""
+
+from __future__ import annotations
+
+from bisect import bisect_right
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from case_record.record import FILE_NAME, CaseRecord, CaseRecordError
+from case_record.rows import Measurement
+from service.procedure.plane import ImagePlane
+from service.procedure.registry import APPROACHES
+from service.procedure.targets import TARGET_SET, TARGET_WITHDRAWN, current_target, target_of
+from service.room.summaries import CaseSummary, KnownTarget, MeasurementBody
+
+_MOST_CASES = 200
+
+
+@dataclass(frozen=True)
+class Targets:
+    """Since when which target (patient mm) was set, oldest first; None: it was withdrawn."""
+
+    since_s: tuple[float, ...]
+    patient_mm: tuple[tuple[float, float, float] | None, ...]
+
+    def at(self, instant_s: float) -> tuple[float, float, float] | None:
+        place = bisect_right(self.since_s, instant_s)
+        return self.patient_mm[place - 1] if place else None
+
+    def body_of(self, row: Measurement) -> MeasurementBody:
+        """Return what the API says about a measurement."""
+        found = row.result or {}
+        return MeasurementBody(
+            measurement_id=row.measurement_id,
+            state=row.state,
+            method=row.method,
+            requested_s=row.requested_s,
+            finished_s=row.finished_s,
+            reason_code=row.reason_code,
+            reason=row.reason,
+            hold_ids=list(row.hold_ids),
+            n_frames=found.get("n_frames", 0),
+            patient_mm=found.get("patient_mm"),
+            sigma_mm=_sigma_mm(found["covariance_mm2"]) if found else None,
+            error_mm=self._error_mm(row),
+            snr=found.get("snr"),
+            has_reconstruction=bool(found.get("reconstruction")),
+        )
+
+    def _error_mm(self, row: Measurement) -> float | None:
+        if row.request.get("slice_position_mm") is not None:
+            return None  # one of two fiducials: the target is the needle's, not this one's
+        target = self.at(row.requested_s)
+        if target is None or not row.result:
+            return None
+        plane = ImagePlane.from_json(row.result["plane"])
+        return float(np.linalg.norm(plane.from_patient(target) - np.array(row.result["plane_mm"])))
+
+
+def _sigma_mm(covariance_mm2: list[list[float]]) -> float:
+    return float(np.sqrt(np.trace(np.array(covariance_mm2)) / 2))
+
+
+def known_targets(record: CaseRecord) -> list[KnownTarget]:
+    """Every target with the procedures that approached it, in the order in which they were set."""
+    approaches: dict[int, list[int]] = {}
+    for row in record.procedures():
+        number = row.arguments.get("target") if row.name in APPROACHES else None
+        if number is not None:
+            approaches.setdefault(number, []).append(row.procedure_id)
+    current = current_target(record)
+    return [
+        KnownTarget(
+            **vars(target_of(event)),
+            current=current is not None and current.number == event.event_id,
+            set_s=event.wall_s,
+            who=event.who,
+            approaches=approaches.get(event.event_id, []),
+        )
+        for event in record.events_of_kind(TARGET_SET)
+    ]
+
+
+def targets_over_time(record: CaseRecord) -> Targets:
+    events = [*record.events_of_kind(TARGET_SET), *record.events_of_kind(TARGET_WITHDRAWN)]
+    events.sort(key=lambda event: event.event_id)
+    return Targets(
+        tuple(event.wall_s for event in events),
+        tuple(target_of(e).patient_mm if e.kind == TARGET_SET else None for e in events),
+    )
+
+
+def case_folder(case_dir: Path, name: str | None) -> Path:
+    """The folder of the present case (None) or of one beside it; CaseRecordError if there is none.
+
+    Only names of folders that are there and hold a record lead anywhere: no path gets through.
+    """
+    if name is None:
+        return case_dir
+    for folder in _case_folders(case_dir):
+        if folder.name == name:
+            return folder
+    raise CaseRecordError(f"There is no case in a folder {name!r} beside the present one.")
+
+
+def _case_folders(case_dir: Path) -> list[Path]:
+    beside = (path.parent for path in case_dir.parent.glob(f"*/{FILE_NAME}"))
+    return sorted({case_dir, *beside})[:_MOST_CASES]
+
+
+def past_cases(case_dir: Path) -> list[CaseSummary]:
+    """Every case folder beside `case_dir`, and itself, newest first; nothing is written there."""
+    summaries = []
+    for folder in _case_folders(case_dir):
+        try:
+            with CaseRecord(folder, read_only=True) as record:
+                summaries.append(_summary(record, folder, folder == case_dir))
+        except CaseRecordError:
+            continue  # a record of a newer program, or none: not ours to show
+    return sorted(summaries, key=lambda case: -case.created_s)
+
+
+def _summary(record: CaseRecord, folder: Path, current: bool) -> CaseSummary:
+    case = record.case()
+    described = record.last_event("case_described")
+    return CaseSummary(
+        folder=folder.name,
+        case_uid=case.case_uid if case else "",
+        label=described.body["label"] if described else "",
+        created_s=case.created_s if case else 0.0,
+        slices=sum(record.count_slices().values()),
+        measurements=len(record.measurements()),
+        punctures=len(record.events_of_kind("puncture")),
+        current=current,
+    )

@@ -1,0 +1,76 @@
+"""Slices and reconstructions as PNG, as raw pixels, and as the DICOM file that was received."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from case_record.record import CaseRecord
+from dicom_slice.pixels import magnitude_pixels
+from dicom_slice.reasons import UnusableError
+
+_WINDOW_PERCENT = (1.0, 99.8)
+
+
+class ImageMissingError(Exception):
+    """There is no such image (yet)."""
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """How a PNG is made: window and level in the image's units (None: automatic), whole scale."""
+
+    window: float | None = None
+    level: float | None = None
+    scale: int = 1
+
+
+def slice_pixels(record: CaseRecord, slice_id: int) -> NDArray[np.float64]:
+    """Return the magnitudes of a slice (rows, cols); raises ImageMissingError."""
+    row = record.slice(slice_id)
+    try:
+        return magnitude_pixels(record.case_dir / row.path, row.frame)
+    except (UnusableError, OSError) as error:
+        raise ImageMissingError(f"slice {slice_id}: {error}") from error
+
+
+def slice_file(record: CaseRecord, slice_id: int) -> Path:
+    """Return the DICOM file of a slice, bit for bit as it was received."""
+    path = record.case_dir / record.slice(slice_id).path
+    if not path.is_file():
+        raise ImageMissingError(f"slice {slice_id}: its file is not there any more")
+    return path
+
+
+def reconstruction_pixels(record: CaseRecord, measurement_id: int) -> NDArray[np.float64]:
+    """Return the super-resolution image of a measurement; raises ImageMissingError."""
+    measurement = record.measurement(measurement_id)
+    name = (measurement.result or {}).get("reconstruction")
+    if not name or not (record.case_dir / name).is_file():
+        raise ImageMissingError(f"measurement {measurement_id} has no reconstruction")
+    pixels: NDArray[np.float64] = np.load(record.case_dir / name).astype(np.float64)
+    return pixels
+
+
+def png_of(pixels: NDArray[np.floating], how: Rendering = Rendering()) -> bytes:
+    """Return an 8-bit PNG; automatic window: all but the brightest pixels differ."""
+    low, high = np.percentile(pixels, _WINDOW_PERCENT).tolist()
+    window = how.window if how.window is not None else high - low
+    level = how.level if how.level is not None else (high + low) / 2
+    scaled = np.clip((pixels - level) / max(window, 1e-12) + 0.5, 0.0, 1.0)
+    grey = np.round(scaled * 255).astype(np.uint8)
+    if how.scale > 1:
+        grey = grey.repeat(how.scale, axis=0).repeat(how.scale, axis=1)
+    buffer = io.BytesIO()
+    Image.fromarray(grey).save(buffer, "PNG")
+    return buffer.getvalue()
+
+
+def raw_of(pixels: NDArray[np.floating]) -> bytes:
+    """Return the pixels row by row as little-endian 32-bit floats."""
+    return pixels.astype("<f4").tobytes()

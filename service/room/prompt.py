@@ -1,0 +1,56 @@
+"""What the operator is told in one line: what the room waits for, how the last procedure ended."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from case_record.record import CaseRecord
+from robot_bridge.client.client import BridgeStatus
+from robot_bridge.protocol.phases import WorkPhase
+from room_config.load import Config
+from service.procedure.registry import CALIBRATION, GUIDE_CALIBRATION
+from service.procedure.targets import current_entry, current_target
+from service.room.execution import Execution
+from service.room.link import RoomLink
+
+
+def prompt(
+    config: Config, record: CaseRecord, link: RoomLink, execution: Execution, ready: bool
+) -> str:
+    """What is to be done next; ready: the needle guide is at its target."""
+    if link.status is None:
+        return f"No link to the robot: {link.problem}"
+    return execution.prompt or _idle_prompt(config, record, link.status, ready)
+
+
+def _idle_prompt(config: Config, record: CaseRecord, status: BridgeStatus, ready: bool) -> str:
+    if ready:
+        return "READY: puncture; then say when the needle is out."
+    if status.phase is WorkPhase.EMERGENCY:
+        return "EMERGENCY: the drives are parked. See to patient and needle; then re-arm."
+    if status.stopped:
+        return f"Stopped ({plain_words(status.stop_reason)}). Re-arm to go on."
+    if not status.armed:
+        return "Arm the robot."
+    if not is_calibrated(config, record):
+        return "Start the calibration."
+    if current_target(record) is None:
+        return "Set a target."
+    if config.service.guide is not None and current_entry(record) is None:
+        return "Set an entry point."
+    return "Start the approach, or set another target."
+
+
+def is_calibrated(config: Config, record: CaseRecord) -> bool:
+    """As the room is used: with the guide's four axes if it has them."""
+    name = CALIBRATION if config.service.guide is None else GUIDE_CALIBRATION
+    return record.last_procedure(name, "done") is not None
+
+
+def plain_words(code: str) -> str:
+    return code.replace("_", " ")
+
+
+def outcome_text(name: str, state: str, result: Any) -> str:
+    reason = (result or {}).get("reason", "")
+    return f"{name} {state}" + (f": {reason}" if reason else "")

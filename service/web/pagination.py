@@ -1,0 +1,27 @@
+"""What many routes have in common: ids, pages, and the errors of questions."""
+
+from __future__ import annotations
+
+from typing import Annotated
+
+from fastapi import Path as PathParameter
+from fastapi import Query, Request, Response
+
+from service.web.problems import responses
+
+MOST_ID = 2**53
+Id = Annotated[int, PathParameter(ge=1, le=MOST_ID)]
+After = Annotated[
+    int, Query(ge=0, le=MOST_ID, description="Begin after this id (before it with `newest`).")
+]
+Limit = Annotated[int, Query(ge=1, le=1000)]
+Newest = Annotated[bool, Query(description="The newest first instead of the oldest first.")]
+ERRORS = responses(401, 422, 429)
+ERRORS_WITH_ID = responses(401, 404, 422, 429)
+
+
+def link_onward(request: Request, response: Response, ids: list[int], limit: int) -> None:
+    """Name the next page in the `Link` header, if this one is full."""
+    if len(ids) == limit:
+        onward = request.url.include_query_params(after=ids[-1])
+        response.headers["Link"] = f'<{onward.path}?{onward.query}>; rel="next"'

@@ -1,0 +1,208 @@
+"""What every request passes first: size, origin, who asks, what that role may do; and what every
+response carries: the security headers.
+
+Plain ASGI, so that the event stream is not buffered. A STOP is let through whatever can be let
+through: from viewers, without CSRF token, during a lock-out; only a caller that is nobody is not.
+"""
+
+from __future__ import annotations
+
+import time
+from http.cookies import CookieError, SimpleCookie
+from urllib.parse import urlsplit
+
+import structlog
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.responses import Response
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.web.access import ANYBODY, Access, Identity, LockedOutError
+from service.web.problems import ProblemError, problem
+
+COOKIE = "autospine_session"
+STOP_PATH = "/api/v1/stop"
+SESSION_PATH = "/api/v1/session"
+_MOST_BODY_BYTES = 64 * 1024
+_SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
+_LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
+_PUBLIC = frozenset({"/", "/healthz"})
+
+SECURITY_HEADERS = {
+    "content-security-policy": "default-src 'none'; script-src 'self'; style-src 'self'; "
+    "img-src 'self' blob: data:; connect-src 'self'; base-uri 'none'; form-action 'self'; "
+    "frame-ancestors 'none'",
+    "x-content-type-options": "nosniff",
+    "x-frame-options": "DENY",
+    "referrer-policy": "no-referrer",
+    "cross-origin-opener-policy": "same-origin",
+    "cross-origin-resource-policy": "same-origin",
+    "permissions-policy": "camera=(), microphone=(), geolocation=()",
+}
+
+
+class Gate:
+    """Wraps the application; puts the caller's `Identity` into `scope["state"]`."""
+
+    def __init__(self, app: ASGIApp, access: Access, *, uses_tls: bool) -> None:
+        self._app = app
+        self._access = access
+        self._uses_tls = uses_tls
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        send = self._with_headers(send)
+        try:
+            self._let_in(scope)
+            if scope["method"] not in _SAFE:
+                receive = await _bounded(Headers(scope=scope), receive)
+        except ProblemError as error:
+            answer: Response = problem(
+                error.status, error.code, error.detail, headers=error.headers
+            )
+            await answer(scope, receive, send)
+            return
+        await self._app(scope, receive, send)
+
+    def _with_headers(self, send: Send) -> Send:
+        async def sending(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                headers = MutableHeaders(scope=message)
+                for name, value in SECURITY_HEADERS.items():
+                    headers.setdefault(name, value)
+                if self._uses_tls:
+                    headers["strict-transport-security"] = "max-age=31536000"
+            await send(message)
+
+        return sending
+
+    def _let_in(self, scope: Scope) -> None:
+        headers = Headers(scope=scope)
+        path, method = scope["path"], scope["method"]
+        self._check_origin(headers, method)
+        scope.setdefault("state", {})["identity"] = ANYBODY
+        if not self._access.rules.needs_token or _is_public(path, method):
+            return
+        identity = self._who(scope, headers, path)
+        scope["state"]["identity"] = identity
+        if method in _SAFE or path == STOP_PATH:
+            return
+        if identity.uses_cookie and headers.get("x-csrf-token") != identity.csrf:
+            raise ProblemError(403, "csrf", "The X-CSRF-Token is missing or old: load the page.")
+        if identity.role != "operator" and path != SESSION_PATH:
+            detail = f"{identity.name} is a viewer: viewers may look and press STOP only."
+            raise ProblemError(403, "wrong_role", detail)
+
+    def _check_origin(self, headers: Headers, method: str) -> None:
+        """No other web page may use this browser's way to us."""
+        host = headers.get("host", "")
+        if not self._access.rules.needs_token and _host_name(host) not in _LOOPBACK:
+            detail = f"Without tokens this service is asked for by a loopback name, not {host!r}."
+            raise ProblemError(403, "wrong_host", detail)
+        origin = headers.get("origin")
+        if origin is not None and method not in _SAFE and urlsplit(origin).netloc != host:
+            raise ProblemError(403, "cross_origin", "Orders from other web pages are not taken.")
+
+    def _who(self, scope: Scope, headers: Headers, path: str) -> Identity:
+        """The caller, by bearer token or by session cookie; raises ProblemError."""
+        scheme, _, token = headers.get("authorization", "").partition(" ")
+        if scheme.lower() == "bearer" and token:
+            return self._by_token(scope, token.strip(), path)
+        secret = _cookie(headers)
+        if secret:
+            known = self._access.session(secret, time.monotonic(), time.time())
+            if known is not None:
+                return known
+        raise unauthorized("Log in with your token, or send it as a bearer token.")
+
+    def _by_token(self, scope: Scope, token: str, path: str) -> Identity:
+        try:
+            if path == STOP_PATH:
+                return self._access.check_token_for_stop(token, wall_s=time.time())
+            return check_token(self._access, scope, token)
+        except PermissionError as error:
+            raise unauthorized(str(error)) from None
+
+
+def check_token(access: Access, scope: Scope, token: str) -> Identity:
+    """Return the token's owner; raises PermissionError, or ProblemError 429 during a lock-out."""
+    address = scope["client"][0] if scope.get("client") else "unknown"
+    try:
+        return access.check_token(token, address, now_s=time.monotonic(), wall_s=time.time())
+    except PermissionError:
+        structlog.get_logger().warning("wrong token", address=address)
+        raise
+    except LockedOutError as error:
+        wait = {"Retry-After": str(int(error.wait_s) + 1)}
+        raise ProblemError(429, "locked_out", str(error), wait) from None
+
+
+def unauthorized(detail: str) -> ProblemError:
+    return ProblemError(401, "unauthorized", detail, {"WWW-Authenticate": "Bearer"})
+
+
+def _is_public(path: str, method: str) -> bool:
+    if path in _PUBLIC or path.startswith("/page/"):
+        return method in _SAFE
+    return path == SESSION_PATH and method == "POST"
+
+
+def _host_name(host: str) -> str:
+    return (urlsplit(f"//{host}").hostname or "") if host else ""
+
+
+def _cookie(headers: Headers) -> str:
+    try:
+        morsel = SimpleCookie(headers.get("cookie", "")).get(COOKIE)
+    except CookieError:
+        return ""
+    return morsel.value if morsel else ""
+
+
+def session_secret(headers: Headers) -> str:
+    """Return the secret of the caller's session cookie, or an empty text."""
+    return _cookie(headers)
+
+
+async def _bounded(headers: Headers, receive: Receive) -> Receive:
+    """Return a `receive` of a body that is known to be small; ProblemError 413 if it is not."""
+    length = headers.get("content-length", "0")
+    if not length.isdecimal() or int(length) > _MOST_BODY_BYTES:
+        raise too_large()
+    read = 0
+    body = bytearray()
+    while True:
+        message = await receive()
+        if message["type"] != "http.request":
+            return _once_more(message)
+        body += message.get("body", b"")
+        read = len(body)
+        if read > _MOST_BODY_BYTES:
+            raise too_large()
+        if not message.get("more_body", False):
+            return _replayed(bytes(body), receive)
+
+
+def too_large() -> ProblemError:
+    return ProblemError(413, "too_large", f"A body has at most {_MOST_BODY_BYTES} bytes.")
+
+
+def _once_more(message: Message) -> Receive:
+    async def receive() -> Message:
+        return message
+
+    return receive
+
+
+def _replayed(body: bytes, rest: Receive) -> Receive:
+    sent = False
+
+    async def receive() -> Message:
+        nonlocal sent
+        if sent:
+            return await rest()
+        sent = True
+        return {"type": "http.request", "body": body, "more_body": False}
+
+    return receive

@@ -1,0 +1,120 @@
+"""What the record says: events, slices, measurements, targets, cases."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+from fastapi import APIRouter, Query, Request, Response
+
+from case_record.record import CaseRecord
+from case_record.rows import SliceRow
+from service.room.history import known_targets, past_cases, targets_over_time
+from service.room.summaries import CaseSummary, KnownTarget, MeasurementBody
+from service.web.pagination import ERRORS, ERRORS_WITH_ID, After, Id, Limit, Newest, link_onward
+from service.web.schemas import EventBody, SliceBody
+
+
+def event_router(case_dir: Path) -> APIRouter:
+    """What happened, in this case and in those before it."""
+    router = APIRouter(prefix="/api/v1", tags=["record"])
+
+    @router.get("/events", responses=ERRORS)
+    def events(
+        request: Request,
+        response: Response,
+        after: After = 0,
+        limit: Limit = 200,
+        newest: Newest = False,
+    ) -> list[EventBody]:
+        """Everything that happened; `Link: rel="next"` leads on."""
+        with CaseRecord(case_dir) as record:
+            found = (
+                record.newest_events(limit, after or None)
+                if newest
+                else record.events(after, limit)
+            )
+        link_onward(request, response, [e.event_id for e in found], limit)
+        return [
+            EventBody(
+                event_id=e.event_id,
+                wall_s=e.wall_s,
+                source=e.source,
+                who=e.who,
+                kind=e.kind,
+                body=dict(e.body),
+            )
+            for e in found
+        ]
+
+    @router.get("/cases", responses=ERRORS)
+    def cases() -> list[CaseSummary]:
+        """The case folders beside the present one, newest first."""
+        return past_cases(case_dir)
+
+    return router
+
+
+def slice_router(case_dir: Path) -> APIRouter:
+    """The slices that were received."""
+    router = APIRouter(prefix="/api/v1", tags=["record"])
+
+    @router.get("/slices", responses=ERRORS)
+    def slices(
+        request: Request,
+        response: Response,
+        state: Annotated[str | None, Query(pattern="^(assigned|pending|quarantined)$")] = None,
+        after: After = 0,
+        limit: Limit = 100,
+        newest: Newest = False,
+    ) -> list[SliceBody]:
+        """Every slice that was received, with what was decided about it and by whom."""
+        with CaseRecord(case_dir) as record:
+            rows = record.page_of_slices(after_id=after, limit=limit, newest=newest, state=state)
+        link_onward(request, response, [row.slice_id for row in rows], limit)
+        return [_slice_body(row) for row in rows]
+
+    @router.get("/slices/{slice_id}", responses=ERRORS_WITH_ID)
+    def one_slice(slice_id: Id) -> SliceBody:
+        """One slice."""
+        with CaseRecord(case_dir) as record:
+            return _slice_body(record.slice(slice_id))
+
+    return router
+
+
+def measurement_router(case_dir: Path) -> APIRouter:
+    """What was measured, and how far that was from which target."""
+    router = APIRouter(prefix="/api/v1", tags=["record"])
+
+    @router.get("/measurements", responses=ERRORS)
+    def measurements(
+        request: Request,
+        response: Response,
+        after: After = 0,
+        limit: Limit = 100,
+        newest: Newest = False,
+    ) -> list[MeasurementBody]:
+        """Every measurement, with its error to the target that was set at that time."""
+        with CaseRecord(case_dir) as record:
+            rows = record.page_of_measurements(after_id=after, limit=limit, newest=newest)
+            targets = targets_over_time(record)
+        link_onward(request, response, [row.measurement_id for row in rows], limit)
+        return [targets.body_of(row) for row in rows]
+
+    @router.get("/targets", responses=ERRORS)
+    def targets() -> list[KnownTarget]:
+        """Every target of the case in the order in which they were set, with its approaches."""
+        with CaseRecord(case_dir) as record:
+            return known_targets(record)
+
+    return router
+
+
+def _slice_body(row: SliceRow) -> SliceBody:
+    names = set(SliceBody.model_fields) - {"series_description", "geometry"}
+    return SliceBody(
+        series_description=str(row.header.get("series_description") or ""),
+        geometry=row.header.get("geometry") or None,
+        **{name: getattr(row, name) for name in names},
+    )

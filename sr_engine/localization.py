@@ -1,0 +1,42 @@
+"""The answer of every localization."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from sr_engine.psf import Psf
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True, eq=False)
+class Localization:
+    """Centre of the fiducial in the reference pose, and how well it is known.
+
+    centre_px: (row, col), pixel (0, 0) has its centre at (0.0, 0.0).
+    covariance_px2: (2, 2) of the centre, row and col.
+    radius_px, amplitude, background, snr: means over the frames; amplitude is negative for an
+      object darker than what surrounds it; snr = |amplitude| / noise std per channel.
+    residuals_px: (N, 2), what each frame's centre less its shift differs by from centre_px.
+    chi2_per_dof: of the residuals against their covariances (2N - 2 degrees of freedom); for one
+      frame, of its pixels against the model.
+    """
+
+    centre_px: Array
+    covariance_px2: Array
+    radius_px: float
+    amplitude: float
+    background: float
+    snr: float
+    sigma: float
+    chi2_per_dof: float
+    n_frames: int
+    method: str
+    residuals_px: Array
+    psf: Psf
+
+    @property
+    def sigma_px(self) -> Array:
+        """Standard deviations (row, col)."""
+        return np.asarray(np.sqrt(np.diag(self.covariance_px2)))
