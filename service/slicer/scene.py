@@ -47,6 +47,12 @@ def scene_of(state: RoomState) -> Scene:
     return scene
 
 
+def stale_scene(state: RoomState) -> Scene:
+    """Only that nobody knows what the room does now; its needle guide is nowhere known."""
+    text = "The control loop does not say what the room is doing."
+    return {"AutoSPINe": status("AutoSPINe", state.at_s, STATUS_NOT_READY, "STALE", text)}
+
+
 class Images:
     """The images of a scene, each encoded once."""
 

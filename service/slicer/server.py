@@ -12,17 +12,15 @@ import asyncio
 import contextlib
 import ipaddress
 import socket
-import sqlite3
 from pathlib import Path
 
 import structlog
 
-from case_record.connection import CaseRecordError
 from case_record.record import CaseRecord
 from room_config.load import ConfigError
 from room_config.openigtlink import OpenIgtLinkConfig
-from service.room.control import ControlLoop
-from service.slicer.scene import Images, Scene, scene_of
+from service.room.control import STALE_S, ControlLoop
+from service.slicer.scene import Images, Scene, scene_of, stale_scene
 
 _LOOK_S = 0.05
 _STATUS_EVERY_S = 1.0
@@ -95,10 +93,12 @@ class OpenIgtLinkServer:
             if not self.receivers or not (due or state.revision != revision):
                 continue
             revision, told_s = state.revision, now_s()
-            scene = scene_of(state)
+            # what the room no longer says is not sent as what it does now
+            is_stale = self._loop.state_age_s > STALE_S
+            scene = stale_scene(state) if is_stale else scene_of(state)
             try:
                 scene |= await asyncio.to_thread(self._images_of_state)
-            except (CaseRecordError, sqlite3.Error, OSError, ValueError) as error:
+            except Exception as error:
                 log.warning("scene without images", reason=str(error))
             async with self._changed:
                 self._scene = scene
