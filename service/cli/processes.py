@@ -47,7 +47,8 @@ def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> Non
 
     def scene(loop: ControlLoop) -> OpenIgtLinkServer:
         assert followers is not None
-        return OpenIgtLinkServer(room.openigtlink, room.room.case_dir, loop, followers)
+        guide = room.service.guide
+        return OpenIgtLinkServer(room.openigtlink, room.room.case_dir, loop, followers, guide)
 
     failed = threading.Event()
 
