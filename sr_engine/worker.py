@@ -17,6 +17,7 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
+from case_record.cases import Cases
 from case_record.presence import Presence
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
@@ -91,7 +92,7 @@ class PointSpreads:
 
 def serve(config: Config, should_stop: Callable[[], bool]) -> None:
     """Work until `should_stop`; looks for requests every `poll_s`, says every second: alive."""
-    case_dir = config.room.case_dir
+    case_dir = Cases(*config.room.folders).required()
     alive = case_dir / ALIVE
     said_s = 0.0
     psfs = PointSpreads(config.imaging.point_spread)

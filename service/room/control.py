@@ -17,6 +17,7 @@ from typing import Any
 
 import structlog
 
+from case_record.cases import Cases
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Procedure
 from room_config.load import Config
@@ -75,6 +76,7 @@ class ControlLoop:
     ) -> None:
         """others_wrong: what else is an alarm now; must answer at once."""
         self._config = config
+        self._cases = Cases(*config.room.folders)
         self._link = link
         self._others_wrong = others_wrong
         self._link.client.while_moving = self._while_moving
@@ -130,7 +132,7 @@ class ControlLoop:
 
     def _run(self) -> None:
         try:
-            with CaseRecord(self._config.room.case_dir, create=True) as record:
+            with CaseRecord(self._cases.required(), create=True) as record:
                 self._serve(record)
         except _Closing:
             pass

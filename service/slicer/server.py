@@ -13,10 +13,10 @@ import contextlib
 import ipaddress
 import socket
 import sqlite3
-from pathlib import Path
 
 import structlog
 
+from case_record.cases import Cases
 from case_record.connection import CaseRecordError
 from case_record.record import CaseRecord
 from room_config.load import ConfigError
@@ -55,13 +55,13 @@ class OpenIgtLinkServer:
     def __init__(
         self,
         config: OpenIgtLinkConfig,
-        case_dir: Path,
+        cases: Cases,
         loop: ControlLoop,
         listening: socket.socket,
     ) -> None:
         self._listening = listening
         self._config = config
-        self._case_dir = case_dir
+        self._cases = cases
         self._loop = loop
         self._networks = [ipaddress.ip_network(text) for text in config.peer_networks]
         self._images = Images()
@@ -108,7 +108,7 @@ class OpenIgtLinkServer:
         state = self._loop.state
         if not state.case_uid:
             return {}
-        with CaseRecord(self._case_dir) as record:
+        with CaseRecord(self._cases.required()) as record:
             return self._images.of(state, record)
 
     # One receiver
