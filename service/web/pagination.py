@@ -24,4 +24,4 @@ def link_onward(request: Request, response: Response, ids: list[int], limit: int
     """Name the next page in the `Link` header, if this one is full."""
     if len(ids) == limit:
         onward = request.url.include_query_params(after=ids[-1])
-        response.headers["Link"] = f'<{onward.path}?{onward.query}>; rel="next"'
+        response.headers["Link"] = f'<?{onward.query}>; rel="next"'
