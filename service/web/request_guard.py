@@ -41,7 +41,9 @@ SECURITY_HEADERS = {
 
 
 class Gate:
-    """Wraps the application; puts the caller's `Identity` into `scope["state"]`."""
+    """Wraps the application; puts the caller's `identity` and public_url's path (`prefix`) into
+    `scope["state"]`.
+    """
 
     def __init__(
         self, app: ASGIApp, access: Access, *, uses_tls: bool, public_url: str = ""
@@ -97,7 +99,7 @@ class Gate:
         headers = Headers(scope=scope)
         path, method = scope["path"], scope["method"]
         self._check_origin(headers, method, path)
-        scope.setdefault("state", {})["identity"] = ANYBODY
+        scope.setdefault("state", {}).update(identity=ANYBODY, prefix=self._origins.path)
         if not self._access.rules.needs_token or _is_public(path, method):
             return
         identity = self._who(scope, headers, path)

@@ -153,6 +153,10 @@ def test_a_program_behind_nginx_orders_follows_and_stops(way: str, tmp_path: Pat
         if "prefix" in way:  # the page's own addresses are relative: without the slash, nothing
             with proxy.client() as outside:
                 bare = outside.get(proxy.url.rstrip("/"))
+                who = {"Authorization": f"Bearer {TOKEN}"}
+                first = outside.get("api/v1/events?limit=1", headers=who)
+                onward = first.url.join(first.links["next"]["url"])
+                assert outside.get(onward, headers=who).status_code == 200
             assert bare.headers["location"].endswith("/rooms/a/")
 
 
