@@ -31,6 +31,7 @@ _TIMEOUT_S = 35.0
 _STOP_TIMEOUT_S = 2.0
 _LONG_TIMEOUT_S = 600.0
 _SILENT_S = 5.0
+_UNAVAILABLE = 503
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -82,8 +83,13 @@ class RoomClient:
     # Looking
 
     def state(self) -> RoomState:
-        """What the room is doing now."""
-        return self._get("/api/v1/state", RoomState)
+        """What the room is doing now; ServiceGoneError while the service does not know it."""
+        try:
+            return self._get("/api/v1/state", RoomState)
+        except RefusedByServiceError as error:
+            if error.status == _UNAVAILABLE:
+                raise ServiceGoneError(f"{self.url}: {error}") from error
+            raise
 
     def session(self) -> SessionBody:
         """Who this client is to the service."""
