@@ -15,6 +15,7 @@ import typer
 import uvicorn
 
 from room_config.load import Config, ConfigError, load_config
+from room_config.networks import with_mapped
 from room_config.shell import announce, configure_logs, on_parent_gone
 
 ConfigOption = Annotated[Path, typer.Option("--config", help="The room's TOML file.")]
@@ -73,6 +74,8 @@ def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> Non
             access_log=False,
             server_header=False,
             timeout_graceful_shutdown=1,
+            proxy_headers=True,
+            forwarded_allow_ips=with_mapped(room.service.trusted_proxies),
             ssl_certfile=room.service.tls_certificate,
             ssl_keyfile=room.service.tls_key,
         )
