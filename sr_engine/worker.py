@@ -42,7 +42,7 @@ from sr_engine.localize import SEARCH_PX, localize
 from sr_engine.paper import PaperMethod, PaperSettings, localize_paper
 from sr_engine.psf import Psf
 from sr_engine.recognise import psf_of_noise
-from sr_engine.reconstruct import reconstruct
+from sr_engine.reconstruction.reconstruct import reconstruct
 
 IMAGES = "images"
 ALIVE = "worker.alive"

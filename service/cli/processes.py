@@ -17,6 +17,7 @@ import uvicorn
 from case_record.cases import Cases
 from case_record.presence import Sole
 from room_config.load import Config, ConfigError, load_config
+from room_config.networks import with_mapped
 from room_config.shell import announce, configure_logs, on_parent_gone
 
 ConfigOption = Annotated[Path, typer.Option("--config", help="The room's TOML file.")]
@@ -81,6 +82,8 @@ def _serve(room: Config, cases: Cases, exit_with_parent: bool) -> None:
             access_log=False,
             server_header=False,
             timeout_graceful_shutdown=1,
+            proxy_headers=True,
+            forwarded_allow_ips=with_mapped(room.service.trusted_proxies),
             ssl_certfile=room.service.tls_certificate,
             ssl_keyfile=room.service.tls_key,
         )

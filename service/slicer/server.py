@@ -18,6 +18,7 @@ import structlog
 from case_record.cases import Cases
 from case_record.record import CaseRecord
 from room_config.load import ConfigError
+from room_config.networks import address_of
 from room_config.openigtlink import OpenIgtLinkConfig
 from room_config.service import GuideConfig
 from service.room.control import STALE_S, ControlLoop
@@ -140,9 +141,7 @@ class OpenIgtLinkServer:
             writer.transport.abort()
 
     def _why_not(self, peer: str) -> str:
-        if self._networks and not any(
-            ipaddress.ip_address(peer) in network for network in self._networks
-        ):
+        if self._networks and not any(address_of(peer) in network for network in self._networks):
             return "its address is not in openigtlink.peer_networks"
         if self.receivers >= self._config.max_receivers:
             return f"{self.receivers} are connected already"

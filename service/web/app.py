@@ -11,6 +11,7 @@ from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, Protocol
+from urllib.parse import urlsplit
 
 import structlog
 from fastapi import FastAPI, Response
@@ -102,7 +103,7 @@ def create_app(
     )
     uses_tls = service.tls_certificate is not None
     access = Access(access_rules(config))
-    app.add_middleware(Gate, access=access, uses_tls=uses_tls)
+    app.add_middleware(Gate, access=access, uses_tls=uses_tls, public_url=service.public_url)
     add_problems(app)
     app.state.cases = Cases(*config.room.folders)
     orders = Orders(loop)
@@ -121,7 +122,7 @@ def create_app(
         target_router(orders),
         procedure_router(orders),
         clerk_router(orders),
-        access_router(access, uses_tls=uses_tls),
+        access_router(access, cookie_path=urlsplit(service.public_url).path or "/"),
     ):
         app.include_router(router)
     _add_health(app, loop, RoomMetrics(loop, link, broadcast, receivers), outbox)
