@@ -7,7 +7,6 @@ The same policy as systemd units: `examples/systemd/`.
 
 from __future__ import annotations
 
-import os
 import signal
 import threading
 import time
@@ -17,6 +16,7 @@ from typing import Annotated
 import structlog
 import typer
 
+from case_record.cases import Cases
 from room_config.load import load_config
 from room_config.shell import announce, autospine, configure_logs, on_parent_gone
 from service.cli.children import ChildError, Family, quiet_environment
@@ -48,7 +48,7 @@ def up(
         signal.signal(number, lambda *_: stop.set())
     if exit_with_parent:
         on_parent_gone(stop.set)
-    family = Family(room.room.case_dir / "logs")
+    family = Family(Cases(*room.room.folders).home / "logs")
     kept = [Kept(family, name, autospine(name, "--config", str(config))) for name in PROCESSES]
     try:
         _keep(family, kept, stop)
@@ -121,6 +121,4 @@ class Kept:
             self._family.launch(self.name, self._words)
             self._runs = True
         except OSError as error:  # no memory or no descriptors for another process, for one
-            self._has_ended(
-                f"{self.name} could not be started: {os.strerror(error.errno or 0)}", now_s
-            )
+            self._has_ended(f"{self.name} could not be started: {error}", now_s)

@@ -18,7 +18,7 @@ export class Live {
   open(afterId) {
     this.lastId = Math.max(afterId, this.lastId);
     this.source?.close();
-    const source = new EventSource(`/api/v1/events/live?after=${this.lastId}`);
+    const source = new EventSource(`api/v1/events/live?after=${this.lastId}`);
     this.source = source;
     source.addEventListener("state", (message) => this.heard(() => this.on.onState(JSON.parse(message.data))));
     source.addEventListener("record", (message) => this.heard(() => {

@@ -12,12 +12,13 @@ import asyncio
 import contextlib
 import ipaddress
 import socket
-from pathlib import Path
 
 import structlog
 
+from case_record.cases import Cases
 from case_record.record import CaseRecord
 from room_config.load import ConfigError
+from room_config.networks import address_of
 from room_config.openigtlink import OpenIgtLinkConfig
 from room_config.service import GuideConfig
 from service.room.control import STALE_S, ControlLoop
@@ -56,7 +57,7 @@ class OpenIgtLinkServer:
     def __init__(
         self,
         config: OpenIgtLinkConfig,
-        case_dir: Path,
+        cases: Cases,
         loop: ControlLoop,
         listening: socket.socket,
         guide: GuideConfig | None = None,
@@ -64,7 +65,7 @@ class OpenIgtLinkServer:
         """guide: of a room with two fiducials."""
         self._listening = listening
         self._config = config
-        self._case_dir = case_dir
+        self._cases = cases
         self._loop = loop
         self._networks = [ipaddress.ip_network(text) for text in config.peer_networks]
         self._guide = guide
@@ -113,7 +114,7 @@ class OpenIgtLinkServer:
     def _images_of(self, state: RoomState) -> Scene:
         if not state.case_uid:
             return self._images.of(state, None)
-        with CaseRecord(self._case_dir) as record:
+        with CaseRecord(self._cases.required()) as record:
             return self._images.of(state, record)
 
     # One receiver
@@ -140,9 +141,7 @@ class OpenIgtLinkServer:
             writer.transport.abort()
 
     def _why_not(self, peer: str) -> str:
-        if self._networks and not any(
-            ipaddress.ip_address(peer) in network for network in self._networks
-        ):
+        if self._networks and not any(address_of(peer) in network for network in self._networks):
             return "its address is not in openigtlink.peer_networks"
         if self.receivers >= self._config.max_receivers:
             return f"{self.receivers} are connected already"
