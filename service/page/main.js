@@ -2,16 +2,16 @@
 
 import { get, stopRobot } from "./api.js";
 import { byId, setHidden, setText, whenChanged } from "./dom.js";
-import { drawHead, drawLights, showLost, showUp, startClock } from "./head.js";
+import { drawHead, drawLights, showLost, showUp, startClock } from "./header.js";
 import { drawHistory } from "./history_plot.js";
 import { Images } from "./images.js";
 import { addEvent, drawAlarms, drawAside, drawCase, drawJog, drawPast, drawTargets } from "./lists.js";
 import { Live } from "./live.js";
 import { askForToken, leave, whoAmI } from "./login.js";
-import { act, Next } from "./next.js";
-import { drawParts, keepCounting } from "./parts.js";
+import { act, Next } from "./actions.js";
+import { drawParts, keepCounting } from "./system_status.js";
 import { drawScannerClock, heardFromRoom } from "./scanner_clock.js";
-import { drawNumbers } from "./numbers.js";
+import { drawNumbers } from "./distance.js";
 import { drawStages } from "./stage_map.js";
 
 const page = { state: null, role: "viewer", measurements: [], connected: false };

@@ -3,8 +3,8 @@
 
 import { order } from "./api.js";
 import { byId, h, replace, setText, whenChanged } from "./dom.js";
-import { act } from "./next.js";
-import { day } from "./words.js";
+import { act } from "./actions.js";
+import { day } from "./format.js";
 
 const DAY_S = 86400;
 // a person presses within this of the second that is shown (1 sigma of eye and hand, and its rounding)

@@ -12,10 +12,10 @@ import asyncio
 import contextlib
 import ipaddress
 import socket
-from pathlib import Path
 
 import structlog
 
+from case_record.cases import Cases
 from case_record.record import CaseRecord
 from room_config.load import ConfigError
 from room_config.networks import address_of
@@ -57,7 +57,7 @@ class OpenIgtLinkServer:
     def __init__(
         self,
         config: OpenIgtLinkConfig,
-        case_dir: Path,
+        cases: Cases,
         loop: ControlLoop,
         listening: socket.socket,
         guide: GuideConfig | None = None,
@@ -65,7 +65,7 @@ class OpenIgtLinkServer:
         """guide: of a room with two fiducials."""
         self._listening = listening
         self._config = config
-        self._case_dir = case_dir
+        self._cases = cases
         self._loop = loop
         self._networks = [ipaddress.ip_network(text) for text in config.peer_networks]
         self._guide = guide
@@ -114,7 +114,7 @@ class OpenIgtLinkServer:
     def _images_of(self, state: RoomState) -> Scene:
         if not state.case_uid:
             return self._images.of(state, None)
-        with CaseRecord(self._case_dir) as record:
+        with CaseRecord(self._cases.required()) as record:
             return self._images.of(state, record)
 
     # One receiver
