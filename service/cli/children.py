@@ -18,6 +18,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from room_config.exit_codes import COULD_NOT
+
 MOST_LOG_BYTES = 16 * 2**20
 LOGS_KEPT = 4
 _TAIL_LINES = 3
@@ -27,7 +29,7 @@ _LAST_WORDS_BYTES = 64 * 1024
 class ChildError(Exception):
     """A child did not start, or ended; the text is one line with its own last words."""
 
-    exit_code = 3
+    exit_code = COULD_NOT
 
 
 class Child:

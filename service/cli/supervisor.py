@@ -17,6 +17,7 @@ import structlog
 import typer
 
 from case_record.cases import Cases
+from room_config.exit_codes import BAD_INPUT
 from room_config.load import load_config
 from room_config.shell import announce, autospine, configure_logs, on_parent_gone
 from service.cli.children import ChildError, Family, quiet_environment
@@ -29,7 +30,6 @@ END_S = 1.5
 _STABLE_S = 30.0
 _LOOK_S = 0.1
 _ROTATE_EVERY_S = 5.0
-_BAD_INPUT = 2
 
 
 @app.command()
@@ -98,7 +98,7 @@ class Kept:
             code = child.process.poll()
             if code is None:
                 return
-            if code == _BAD_INPUT and not was_ready:
+            if code == BAD_INPUT and not was_ready:
                 raise ChildError(child.describe_end())
             self._has_ended(child.describe_end(), now_s)
         if not self._runs and now_s >= self._start_at_s:
