@@ -34,6 +34,7 @@ from service.room.execution import Execution, ProcedureAbortedError
 from service.room.link import RoomLink
 from service.room.readiness import ConflictError
 from service.room.state import RoomState
+from service.room.stop_latch import StopLatch
 
 _TICK_S = 0.002
 _PUBLISH_EVERY_S = 0.1
@@ -52,16 +53,20 @@ _WHILE_MOVING = frozenset(
         "set_entry",
     }
 )
+# the safe direction, and what is only written down: never too late, and not void after a STOP
+_ALWAYS = frozenset({"note_stop", "abort", "lock_motion", "describe_case", "compare_clocks"})
+OLDEST_ORDER_S = 3.0
 log = structlog.get_logger()
 
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """A command of `Commands` by name, and where its answer goes."""
+    """A command of `Commands` by name, when it was asked for (monotonic), where its answer goes."""
 
     name: str
     arguments: dict[str, Any]
     future: Future[Any]
+    asked_s: float
 
 
 class ControlLoop:
@@ -86,6 +91,7 @@ class ControlLoop:
         self._state = RoomState.initial(config)
         self._failure: BaseException | None = None
         self._commands: Commands | None = None
+        self._stops = StopLatch()
 
     @property
     def state(self) -> RoomState:
@@ -104,15 +110,17 @@ class ControlLoop:
         self._closing.set()
         self._thread.join(timeout=10.0)
 
-    def call(self, name: str, arguments: Mapping[str, Any]) -> Any:
+    def call(self, name: str, arguments: Mapping[str, Any], asked_s: float | None = None) -> Any:
         """Carry out a command of `Commands` in the loop's thread and return what it returns.
 
-        Raises what the command raises, and TimeoutError if the loop did not come to it; it is then
-        not carried out later either.
+        asked_s: when it was asked for, monotonic clock (default: now). Raises what the command
+        raises, ConflictError if it is too old or STOP was pressed since, and TimeoutError if the
+        loop did not come to it; it is then not carried out later either.
         """
         if self._failure is not None:
             raise ConflictError("control_loop", f"The control loop ended: {self._failure}")
-        asked = _Asked(name, dict(arguments), Future())
+        asked_s = time.monotonic() if asked_s is None else asked_s
+        asked = _Asked(name, dict(arguments), Future(), asked_s)
         self._queue.put(asked)
         try:
             return asked.future.result(timeout=_PATIENCE_S)
@@ -121,10 +129,28 @@ class ControlLoop:
                 raise
             return asked.future.result(timeout=_PATIENCE_S)
 
-    def stop(self, by: str, *, emergency: bool = False) -> None:
-        """Stop the robot now, from any thread; the procedure that runs is aborted."""
+    def stop(self, by: str, *, emergency: bool = False) -> int:
+        """Stop the robot now, from any thread; the procedure that runs is aborted.
+
+        Return the number of this STOP: until `stop_answered` says that whoever pressed it was told
+        what became of it, every order that moves or unlocks is void.
+        """
+        number = self._stops.press()
         self._link.client.request_stop(emergency=emergency)
-        self._queue.put(_Asked("note_stop", {"by": by, "emergency": emergency}, Future()))
+        arguments = {"by": by, "emergency": emergency}
+        self._queue.put(_Asked("note_stop", arguments, Future(), time.monotonic()))
+        return number
+
+    def stop_answered(self, number: int) -> None:
+        """See `stop`."""
+        self._stops.answer(number)
+
+    def stop_outcome(self) -> str:
+        """What became of the last STOP: `stopped`, `on_its_way` or `not_delivered` (yet)."""
+        if not self._link.client.stop_acknowledged:
+            return "not_delivered"
+        robot = self._state.robot
+        return "stopped" if robot.linked and robot.stopped and not robot.moving else "on_its_way"
 
     # From here on everything runs in the loop's own thread
 
@@ -144,7 +170,7 @@ class ControlLoop:
     def _serve(self, record: CaseRecord) -> None:
         case = record.start_case(self._config.room.name, seed=0)
         execution = Execution(self._config, record, self._link, self._tick)
-        self._commands = Commands(Room(self._config, record, self._link, execution))
+        self._commands = Commands(Room(self._config, record, self._link, execution, self._stops))
         self._record, self._execution = record, execution
         self._describer = Describer(self._config, record, self._link, self._others_wrong)
         while not self._closing.is_set():
@@ -178,6 +204,7 @@ class ControlLoop:
                 record.append_event("procedure_done", source, source="service")
         finally:
             execution.clear()
+        self._keep_ready()  # READY is not shown before motion is locked
         self._publish()
 
     def _make_target(self, recorded: Procedure, place: Place | GuidePlace) -> None:
@@ -204,10 +231,14 @@ class ControlLoop:
         if self._closing.is_set():
             raise _Closing
         self._answer_queue()
-        if self._publish_if_due() and self._commands is not None:
-            self._commands.keep_lock()
+        if self._publish_if_due():
+            self._keep_ready()
         # last: what the waiting step looks at next is fresh, and screens do not delay a decision
         self._link.pump(_TICK_S)
+
+    def _keep_ready(self) -> None:
+        if self._commands is not None:
+            self._commands.keep_ready()
 
     def _while_moving(self) -> None:
         """Called by the link again and again while it waits for the end of a motion."""
@@ -220,7 +251,38 @@ class ControlLoop:
                 asked = self._queue.get_nowait()
             except queue.Empty:
                 return
-            _answer(self._commands, asked, moving, self._publish)
+            self._answer(self._commands, asked, moving)
+
+    def _answer(self, commands: Commands, asked: _Asked, moving: bool) -> None:
+        """Carry out what was asked; the state that shows it is published before the answer."""
+        if not asked.future.set_running_or_notify_cancel():
+            return  # whoever asked has given up waiting: not carried out
+        try:
+            self._check(asked, moving)
+            result = commands.carry_out(asked.name, asked.arguments)
+            log.info("command", command=asked.name, by=asked.arguments.get("by"))
+            if not moving:
+                self._keep_ready()
+            self._publish()
+            asked.future.set_result(result)
+        except (ConflictError, CaseRecordError) as error:
+            log.info("refused", command=asked.name, by=asked.arguments.get("by"), why=str(error))
+            asked.future.set_exception(error)
+        except Exception as error:
+            log.exception("command failed", command=asked.name)
+            asked.future.set_exception(error)
+
+    def _check(self, asked: _Asked, moving: bool) -> None:
+        """Raise ConflictError for an order that may not be carried out now, or not any more."""
+        if asked.name not in _ALWAYS and self._stops.voids(asked.asked_s):
+            text = "STOP was pressed after this was asked for: it is not done. Ask again."
+            raise ConflictError("void_after_stop", text)
+        age_s = time.monotonic() - asked.asked_s
+        if asked.name not in _ALWAYS and not age_s <= OLDEST_ORDER_S:
+            text = f"This was asked for {age_s:.1f} s ago: it is not done any more. Ask again."
+            raise ConflictError("stale_order", text)
+        if moving and asked.name not in _WHILE_MOVING:
+            raise ConflictError("moving", "The robot moves: wait until it stands, or press STOP.")
 
     def _publish_if_due(self) -> bool:
         """Publish when something was recorded, and every now and then; whether it was done."""
@@ -241,22 +303,3 @@ class ControlLoop:
 
 class _Closing(Exception):
     """The loop is asked to end; what runs stays as it is recorded."""
-
-
-def _answer(commands: Commands, asked: _Asked, moving: bool, publish: Callable[[], None]) -> None:
-    """Carry out what was asked; the state that shows it is published before the answer is given."""
-    if not asked.future.set_running_or_notify_cancel():
-        return  # whoever asked has given up waiting: not carried out
-    try:
-        if moving and asked.name not in _WHILE_MOVING:
-            raise ConflictError("moving", "The robot moves: wait until it stands, or press STOP.")
-        result = commands.carry_out(asked.name, asked.arguments)
-        log.info("command", command=asked.name, by=asked.arguments.get("by"))
-        publish()
-        asked.future.set_result(result)
-    except (ConflictError, CaseRecordError) as error:
-        log.info("refused", command=asked.name, by=asked.arguments.get("by"), why=str(error))
-        asked.future.set_exception(error)
-    except Exception as error:
-        log.exception("command failed", command=asked.name)
-        asked.future.set_exception(error)
