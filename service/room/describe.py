@@ -85,7 +85,7 @@ class Describer:
                 "ready_lost": _lost_ready(found),
                 "arrival": arrival,
                 "punctured": found is not None and _punctured(record, found.procedure_id),
-                "robot": _robot(link, before.robot),
+                "robot": describe_robot(link, before.robot),
                 "jog_possible": may_start(record, now) is None,
                 "hold": _hold(record),
                 **_slices(record),
@@ -135,7 +135,8 @@ def _condition(seen: bool, running: bool, beat_age_s: float) -> dict[str, str]:
     return {"condition": "up", "detail": ""}
 
 
-def _robot(link: RoomLink, before: RobotState) -> RobotState:
+def describe_robot(link: RoomLink, before: RobotState) -> RobotState:
+    """The bridge as it last said it was; without a link as it was, and that it is not linked."""
     status = link.status
     if status is None:
         return before.model_copy(update={"linked": False, "problem": link.problem})
