@@ -44,8 +44,7 @@ def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> Non
 
     def scene(loop: ControlLoop) -> OpenIgtLinkServer:
         assert followers is not None
-        guide = room.service.guide
-        return OpenIgtLinkServer(room.openigtlink, room.room.case_dir, loop, followers, guide)
+        return OpenIgtLinkServer(room, loop, followers)
 
     app = create_app(
         room, announce=lambda: announce(ready), scene=None if followers is None else scene

@@ -22,6 +22,7 @@ from service.room.describe_measurement import (
 from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.prompt import is_calibrated, outcome_text, prompt
+from service.room.proposals import ProposalBook
 from service.room.readiness import may_start, ready_arrival
 from service.room.state import (
     AcquisitionState,
@@ -56,6 +57,7 @@ class Describer:
         self._record = record
         self._link = link
         self._alarms = AlarmBook()
+        self._proposals = ProposalBook()
         self._processes: list[ProcessState] = []
         self._look_at_s = 0.0
         self._around_id = 0
@@ -91,6 +93,7 @@ class Describer:
                 "error": describe_error(config, record, target_mm),
                 "event_id": record.last_event_id(),
                 "processes": self._look_at_processes(),
+                "proposals": self._proposals.update(record),
             }
         )
         alarms = self._alarms.update([*conditions(state), *self._others_wrong()], record)
