@@ -197,7 +197,7 @@ def _check(trials: int, map_trials: int, seed: int, radius: float, snr: float, b
 
 def _check_point(point: object) -> None:
     """What only the engine knows: the sensitivity's range, the names of the shift sets."""
-    from sr_engine.shiftset import named
+    from sr_engine.reconstruction.shiftset import named
     from studies.numerical import StudyPoint
 
     assert isinstance(point, StudyPoint)

@@ -17,7 +17,7 @@ COULD_NOT = 3
 
 # name: (module:attribute, what it does); an attribute called `main` takes the arguments as a list
 SUBCOMMANDS: dict[str, tuple[str, str]] = {
-    "demo": ("simulator.demo:app", "The whole room, virtual."),
+    "demo": ("simulator.demo.main:app", "The whole room, virtual."),
     "up": ("service.cli.supervisor:app", "Listener, worker and service under one supervisor."),
     "listener": ("dicom_listener.command_line:app", "Receive slices and assign them."),
     "worker": ("service.cli.processes:worker", "Localize and reconstruct."),

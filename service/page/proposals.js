@@ -2,8 +2,8 @@
 
 import { order } from "./api.js";
 import { byId, h, replace, setHidden, whenChanged } from "./dom.js";
-import { act } from "./next.js";
-import { clock, mm } from "./words.js";
+import { act } from "./actions.js";
+import { clock, mm } from "./format.js";
 
 const place = (mm3) => `(${mm3.map((value) => mm(value, 2)).join(", ")}) mm LPS`;
 

@@ -12,22 +12,21 @@ import asyncio
 import contextlib
 import ipaddress
 import socket
-import sqlite3
 from collections import Counter
 from collections.abc import Callable
 from typing import Any, TypeVar
 
 import structlog
 
-from case_record.connection import CaseRecordError
 from case_record.record import CaseRecord
 from room_config.load import Config, ConfigError
+from room_config.networks import address_of
 from room_config.openigtlink import OpenIgtLinkConfig
-from service.room.control import ControlLoop
+from service.room.control import STALE_S, ControlLoop
 from service.room.state import RoomState
 from service.slicer.peer import Peer
 from service.slicer.pose import CURRENT_POSITION, Pose, pose_message, pose_of
-from service.slicer.scene import Images, Scene, scene_of
+from service.slicer.scene import Images, Scene, scene_of, stale
 
 Found = TypeVar("Found")
 _LOOK_S = 0.05
@@ -95,7 +94,9 @@ class OpenIgtLinkServer:
 
     @property
     def state(self) -> RoomState:
-        return self._loop.state
+        """Of now: what the room no longer says is not what it does."""
+        state = self._loop.state
+        return stale(state) if self._loop.state_age_s > STALE_S else state
 
     def stop(self, by: str, *, emergency: bool) -> None:
         self._loop.stop(by, emergency=emergency)
@@ -112,7 +113,7 @@ class OpenIgtLinkServer:
         now_s = asyncio.get_running_loop().time
         while True:
             await asyncio.sleep(_LOOK_S)
-            state = self._loop.state
+            state = self.state
             due = now_s() - told_s >= _STATUS_EVERY_S  # that the room lives
             if not self._peers or not (due or state.revision != revision):
                 continue
@@ -133,13 +134,13 @@ class OpenIgtLinkServer:
     def _from_record(
         self, look: Callable[[RoomState, CaseRecord | None], Found], otherwise: Found
     ) -> Found:
-        state = self._loop.state
+        state = self.state
         try:
             if not state.case_uid:
                 return look(state, None)
             with CaseRecord(self._config.room.case_dir) as record:
                 return look(state, record)
-        except (CaseRecordError, sqlite3.Error, OSError, ValueError, KeyError) as error:
+        except Exception as error:
             log.warning("scene without images and pose", reason=str(error))
             return otherwise
 
@@ -165,9 +166,7 @@ class OpenIgtLinkServer:
             peer.hang_up()
 
     def _why_not(self, host: str) -> str:
-        if self._networks and not any(
-            ipaddress.ip_address(host) in network for network in self._networks
-        ):
+        if self._networks and not any(address_of(host) in network for network in self._networks):
             return "its address is not in openigtlink.peer_networks"
         if self.receivers >= self._own.max_receivers:
             return f"{self.receivers} are connected already"

@@ -184,6 +184,16 @@ def test_who_is_not_on_the_list_is_rejected_with_a_readable_report(tmp_path, rul
             assert a.is_established
 
 
+def test_an_ipv4_sender_to_a_dual_stack_listener_is_known_by_its_ipv4_address(tmp_path):
+    only = {"host": "::", "peer_networks": ("127.0.0.0/8",)}
+    with serving(tmp_path, **only) as server:
+        with associated(server.port) as association:
+            assert association.is_established
+        ipv6 = AE("SCANNER")
+        ipv6.add_requested_context(MR_IMAGE)
+        assert ipv6.associate("::1", server.port, ae_title="AUTOSPINE").is_rejected
+
+
 def test_what_cannot_be_decoded_is_refused_at_negotiation_and_the_report_says_so(tmp_path):
     mpeg = "1.2.840.10008.1.2.4.102"
     with serving(tmp_path, any_storage_class=False) as server:

@@ -21,9 +21,9 @@ from case_record.record import CaseRecord
 from service.cli.children import ChildError, quiet_environment
 from service.client import RoomClient
 from simulator.config import parse_virtual_room
-from simulator.demo_operator import WHO, DemoFailedError, Operator
-from simulator.demo_room import DemoOptions, DemoRoom, known_faults
-from simulator.demo_screen import DemoScreen, final_table
+from simulator.demo.operator import WHO, DemoFailedError, Operator
+from simulator.demo.room import DemoOptions, DemoRoom, known_faults
+from simulator.demo.screen import DemoScreen, final_table
 from simulator.truth_client import TruthAddress
 from simulator.unintended import ask_motions, unintended_motions
 
