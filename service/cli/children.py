@@ -17,13 +17,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from room_config.exit_codes import COULD_NOT
+
 _TAIL_LINES = 3
 
 
 class ChildError(Exception):
     """A child did not start, or ended; the text is one line with its own last words."""
 
-    exit_code = 3
+    exit_code = COULD_NOT
 
 
 class Child:

@@ -12,8 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-BAD_INPUT = 2
-COULD_NOT = 3
+from room_config.exit_codes import BAD_INPUT, COULD_NOT, INTERRUPTED
 
 # name: (module:attribute, what it does); an attribute called `main` takes the arguments as a list
 SUBCOMMANDS: dict[str, tuple[str, str]] = {
@@ -63,7 +62,7 @@ def _run(name: str, words: list[str]) -> int:
             return int(entry(words) or 0)
         return _run_typer(entry, name, words)
     except KeyboardInterrupt:
-        return 130
+        return INTERRUPTED
     except Exception as error:
         if os.environ.get("AUTOSPINE_DEBUG"):
             raise

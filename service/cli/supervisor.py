@@ -11,6 +11,7 @@ from typing import Annotated
 import structlog
 import typer
 
+from case_record.cases import Cases
 from room_config.load import load_config
 from room_config.shell import announce, autospine, configure_logs, on_parent_gone
 from service.cli.children import ChildError, Family, quiet_environment
@@ -38,7 +39,7 @@ def up(
         signal.signal(number, lambda *_: stop.set())
     if exit_with_parent:
         on_parent_gone(stop.set)
-    family = Family(room.room.case_dir / "logs")
+    family = Family(Cases(*room.room.folders).home / "logs")
     try:
         for name in _PROCESSES:
             family.launch(name, autospine(name, "--config", str(config)))

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from case_record.cases import Cases
 from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
@@ -54,6 +55,7 @@ class Describer:
     ) -> None:
         self._others_wrong = others_wrong
         self._config = config
+        self._home = Cases(*config.room.folders).home
         self._record = record
         self._link = link
         self._alarms = AlarmBook()
@@ -116,7 +118,7 @@ class Describer:
             self._look_at_s = time.monotonic() + _LOOK_EVERY_S
             self._processes = [
                 ProcessState(name=p.name, **_condition(p.seen, p.running, p.beat_age_s))
-                for p in who_is_alive(self._config.room.case_dir, PROCESSES)
+                for p in who_is_alive(self._home, PROCESSES)
             ]
         return self._processes
 

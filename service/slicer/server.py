@@ -18,6 +18,7 @@ from typing import Any, TypeVar
 
 import structlog
 
+from case_record.cases import Cases
 from case_record.record import CaseRecord
 from room_config.load import Config, ConfigError
 from room_config.networks import address_of
@@ -55,9 +56,12 @@ def bind_openigtlink(config: OpenIgtLinkConfig) -> socket.socket | None:
 class OpenIgtLinkServer:
     """`start` it in the server's event loop, `close` it at the end."""
 
-    def __init__(self, config: Config, loop: ControlLoop, listening: socket.socket) -> None:
+    def __init__(
+        self, config: Config, cases: Cases, loop: ControlLoop, listening: socket.socket
+    ) -> None:
         self._listening = listening
         self._config = config
+        self._cases = cases
         self._loop = loop
         self._own = config.openigtlink
         self.inwards = self._own.inwards
@@ -138,8 +142,10 @@ class OpenIgtLinkServer:
         try:
             if not state.case_uid:
                 return look(state, None)
-            with CaseRecord(self._config.room.case_dir) as record:
-                return look(state, record)
+            with CaseRecord(self._cases.required()) as record:
+                case = record.case()
+                is_same = case is not None and case.case_uid == state.case_uid
+                return look(state, record if is_same else None)
         except Exception as error:
             log.warning("scene without images and pose", reason=str(error))
             return otherwise
