@@ -13,7 +13,7 @@ from case_record.rows import Measurement, SliceRow
 from room_config.load import Config
 from service.procedure.targets import current_entry, current_target
 from service.room.alarms import AlarmBook, Condition
-from service.room.conditions import conditions
+from service.room.conditions import HANGS, conditions
 from service.room.describe_measurement import (
     describe_error,
     describe_measurement,
@@ -39,7 +39,8 @@ from service.room.state import (
 )
 
 PROCESSES = ("listener", "worker")
-_BEAT_IS_OLD_S = 3.0
+_BEAT_IS_OLD_S = 1.0
+_BEAT_IS_LOST_S = 3.0
 _LOOK_EVERY_S = 0.25
 
 
@@ -128,8 +129,10 @@ def _condition(seen: bool, running: bool, beat_age_s: float) -> dict[str, str]:
         return {"condition": "none", "detail": "has not run on this case yet"}
     if not running:
         return {"condition": "down", "detail": "has ended"}
+    if beat_age_s > _BEAT_IS_LOST_S:
+        return {"condition": "old", "detail": HANGS}
     if beat_age_s > _BEAT_IS_OLD_S:
-        return {"condition": "old", "detail": "does not get on"}
+        return {"condition": "old", "detail": "is quiet"}
     return {"condition": "up", "detail": ""}
 
 
