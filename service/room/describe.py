@@ -6,13 +6,14 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from case_record.cases import Cases
 from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
 from room_config.load import Config
 from service.procedure.targets import current_entry, current_target
 from service.room.alarms import AlarmBook, Condition
-from service.room.conditions import conditions
+from service.room.conditions import HANGS, conditions
 from service.room.context import now_of
 from service.room.describe_measurement import (
     describe_error,
@@ -25,6 +26,7 @@ from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
 from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
 from service.room.prompt import is_calibrated, outcome_text, prompt
+from service.room.proposals import ProposalBook
 from service.room.state import (
     AcquisitionState,
     ArrivalState,
@@ -41,7 +43,8 @@ from service.room.state import (
 )
 
 PROCESSES = ("listener", "worker")
-_BEAT_IS_OLD_S = 3.0
+_BEAT_IS_OLD_S = 1.0
+_BEAT_IS_LOST_S = 3.0
 _LOOK_EVERY_S = 0.25
 
 
@@ -57,9 +60,11 @@ class Describer:
     ) -> None:
         self._others_wrong = others_wrong
         self._config = config
+        self._home = Cases(*config.room.folders).home
         self._record = record
         self._link = link
         self._alarms = AlarmBook()
+        self._proposals = ProposalBook()
         self._processes: list[ProcessState] = []
         self._look_at_s = 0.0
         self._around_id = 0
@@ -98,6 +103,7 @@ class Describer:
                 **_error(config, record, target_mm, now),
                 "event_id": record.last_event_id(),
                 "processes": self._look_at_processes(),
+                "proposals": self._proposals.update(record),
             }
         )
         alarms = self._alarms.update([*conditions(state), *self._others_wrong()], record)
@@ -120,7 +126,7 @@ class Describer:
             self._look_at_s = time.monotonic() + _LOOK_EVERY_S
             self._processes = [
                 ProcessState(name=p.name, **_condition(p.seen, p.running, p.beat_age_s))
-                for p in who_is_alive(self._config.room.case_dir, PROCESSES)
+                for p in who_is_alive(self._home, PROCESSES)
             ]
         return self._processes
 
@@ -130,8 +136,10 @@ def _condition(seen: bool, running: bool, beat_age_s: float) -> dict[str, str]:
         return {"condition": "none", "detail": "has not run on this case yet"}
     if not running:
         return {"condition": "down", "detail": "has ended"}
+    if beat_age_s > _BEAT_IS_LOST_S:
+        return {"condition": "old", "detail": HANGS}
     if beat_age_s > _BEAT_IS_OLD_S:
-        return {"condition": "old", "detail": "does not get on"}
+        return {"condition": "old", "detail": "is quiet"}
     return {"condition": "up", "detail": ""}
 
 
