@@ -29,7 +29,7 @@ from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steps import Outcome, Step
 from service.procedure.targets import ENTRY_SET, TARGET_SET
 from service.room.alarms import Condition
-from service.room.commands import Commands
+from service.room.commands.commands import Commands
 from service.room.context import Room
 from service.room.describe import Describer, describe_robot
 from service.room.execution import Execution, ProcedureAbortedError

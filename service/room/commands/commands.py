@@ -9,11 +9,11 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from service.room.commands_procedure import ProcedureCommands
-from service.room.commands_proposals import ProposalCommands
-from service.room.commands_record import RecordCommands
-from service.room.commands_robot import RobotCommands
-from service.room.commands_target import TargetCommands
+from service.room.commands.procedure import ProcedureCommands
+from service.room.commands.proposals import ProposalCommands
+from service.room.commands.record import RecordCommands
+from service.room.commands.robot import RobotCommands
+from service.room.commands.target import TargetCommands
 from service.room.context import Room
 from service.room.ready_keeper import keep_ready
 
