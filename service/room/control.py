@@ -61,6 +61,9 @@ _WHILE_MOVING = frozenset(
         "confirm_acquisition",
         "give_up_slices",
         "set_entry",
+        "propose",
+        "refuse_proposal",
+        "note_registration",
     }
 )
 log = structlog.get_logger()
