@@ -19,7 +19,7 @@ from dicom_listener.assign import (
     Quarantined,
     assign,
 )
-from dicom_listener.clock import OffsetBounds
+from dicom_listener.clock import OffsetBounds, OffsetUnknown
 from dicom_slice.reasons import Reason
 from dicom_slice.times import AcquisitionInterval
 
@@ -81,7 +81,7 @@ def test_a_slice_without_time_or_with_a_nonsense_time_says_so():
     assert why(decide(a_slice(interval=None))) == Reason.NO_TIME
     nonsense = a_slice(interval=None, time_problem="the year is 0001")
     assert why(decide(nonsense)) == Reason.IMPLAUSIBLE_TIME
-    assert why(decide(offset=None)) == Reason.CLOCK_UNKNOWN
+    assert why(decide(offset=OffsetUnknown("not compared"))) == Reason.CLOCK_UNKNOWN
 
 
 def test_a_slice_from_the_future_or_from_long_ago_shows_a_clock_that_jumped():
@@ -173,14 +173,14 @@ def test_more_slices_than_expected_wait_while_the_hold_stands_and_are_set_aside_
 
 def test_in_arrival_mode_the_operators_confirmation_replaces_the_time():
     timeless = a_slice(interval=None)
-    waiting = decide(timeless, offset=None, arrival_mode=True)
+    waiting = decide(timeless, offset=OffsetUnknown("not compared"), arrival_mode=True)
     assert isinstance(waiting, Pending)
     assert why(waiting) == Reason.NOT_CONFIRMED
     confirmed = [replace(STANDING, confirmed=True)]
-    decision = decide(timeless, holds=confirmed, offset=None, arrival_mode=True)
+    decision = decide(timeless, holds=confirmed, offset=OffsetUnknown("not compared"), arrival_mode=True)
     assert decision == Assigned(1, ARRIVAL, 990.0, 1003.0)
     gone = [replace(STANDING, ended_at_s=1001.0, confirmed=True)]
-    assert why(decide(timeless, holds=gone, offset=None, arrival_mode=True)) == Reason.NO_HOLD
+    assert why(decide(timeless, holds=gone, offset=OffsetUnknown("not compared"), arrival_mode=True)) == Reason.NO_HOLD
 
 
 troubles = st.builds(
