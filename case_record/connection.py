@@ -21,13 +21,25 @@ class CaseRecordError(Exception):
     exit_code = 2
 
 
+class RecordUnavailableError(CaseRecordError):
+    """The record cannot be opened now: locked by another, a full disk, a mount that is gone."""
+
+
 class Connection:
     """What every part of the record stands on. Use it in the thread that opened it.
 
     read_only: nothing is written, not even a migration; a record of another schema is refused.
+    busy_timeout_s: so long a statement waits for another writer before it is an error.
     """
 
-    def __init__(self, case_dir: Path, *, create: bool = False, read_only: bool = False) -> None:
+    def __init__(
+        self,
+        case_dir: Path,
+        *,
+        create: bool = False,
+        read_only: bool = False,
+        busy_timeout_s: float = _BUSY_TIMEOUT_S,
+    ) -> None:
         self.case_dir = Path(case_dir)
         path = self.case_dir / FILE_NAME
         if create:
@@ -35,13 +47,16 @@ class Connection:
         elif not path.is_file():
             raise CaseRecordError(f"{self.case_dir}: no case record ({FILE_NAME}) in this folder")
         where = _read_only_uri(path) if read_only else path.absolute().as_uri()
-        self._db = sqlite3.connect(where, timeout=_BUSY_TIMEOUT_S, isolation_level=None, uri=True)
+        self._db = sqlite3.connect(where, timeout=busy_timeout_s, isolation_level=None, uri=True)
         self._db.row_factory = sqlite3.Row
         try:
             if read_only:
                 self._check_schema()
             else:
                 self._prepare()
+        except sqlite3.OperationalError as error:
+            self._db.close()
+            raise RecordUnavailableError(f"{path}: {error}") from error
         except sqlite3.DatabaseError as error:
             self._db.close()
             raise CaseRecordError(f"{path}: not a usable case record ({error})") from error

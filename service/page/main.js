@@ -45,7 +45,7 @@ const newPast = whenChanged(() => quietly(drawPast()));
 const newMeasurements = whenChanged(() => quietly(loadMeasurements()));
 
 async function loadMeasurements() {
-  const found = await get("/api/v1/measurements?newest=true&limit=60");
+  const found = await get("api/v1/measurements?newest=true&limit=60");
   page.measurements = found.reverse();
   drawHistory({ measurements: page.measurements, toleranceMm: page.state.tolerance_mm, guide: page.state.guide });
 }
@@ -86,7 +86,7 @@ async function begin() {
   page.role = me.role;
   setText(byId("who"), me.needs_token ? `${me.name} (${me.role})` : "");
   setHidden(byId("leave"), !me.needs_token);
-  const events = await get("/api/v1/events?newest=true&limit=120");
+  const events = await get("api/v1/events?newest=true&limit=120");
   byId("events").replaceChildren();
   events.reverse().forEach(addEvent);
   live.open(events.at(-1)?.event_id ?? 0);

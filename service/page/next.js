@@ -8,7 +8,7 @@ import { mm, signedMm } from "./words.js";
 // A plan that has just appeared must be read before it can be confirmed: no accidental double click.
 const READ_FIRST_MS = 700;
 
-const post = (path, body) => () => order("POST", `/api/v1/${path}`, body);
+const post = (path, body) => () => order("POST", `api/v1/${path}`, body);
 
 // Which actions make sense now. The first one that is possible is the large button.
 export function actionsFor(state) {
@@ -92,7 +92,7 @@ export class Next {
       onsubmit: (event) => {
         event.preventDefault();
         const body = depth.value === "" ? {} : { insertion_depth_mm: Number(depth.value) };
-        act(() => order("POST", "/api/v1/puncture", body));
+        act(() => order("POST", "api/v1/puncture", body));
       },
     }, h("label", { htmlFor: "depth" }, "Insertion depth, mm (may stay empty) "), depth,
     h("p", {}, h("button", { class: "main" }, "Record the puncture")));
@@ -108,7 +108,7 @@ export class Next {
     const buttons = question.choices.map((choice) => h("button", {
       type: "button", class: choice === question.choices[0] ? "main" : null,
       id: choice === "confirm" ? "confirm" : null, disabled: true,
-      onclick: () => act(() => order("POST", "/api/v1/answer", {
+      onclick: () => act(() => order("POST", "api/v1/answer", {
         question_id: question.question_id, choice, ...(plan ? { plan_id: plan.plan_id } : {}),
       })),
     }, choice === "confirm" ? "CONFIRM MOVE" : choice.charAt(0).toUpperCase() + choice.slice(1)));

@@ -32,7 +32,7 @@ export const drawParts = whenChanged(({ robot, processes, slices }) => {
 
 async function readCounters() {
   try {
-    const lines = (await getText("/metrics")).split("\n");
+    const lines = (await getText("metrics")).split("\n");
     values = Object.fromEntries(lines.filter((line) => line && !line.startsWith("#")).map((line) => line.split(" ")));
   } catch {
     return; // the stream says when the service is back

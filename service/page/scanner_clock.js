@@ -59,7 +59,7 @@ export const drawScannerClock = whenChanged(({ clock, clock_implies, role }) => 
   const input = h("input", { id: "scanner-shows", placeholder: "hh:mm:ss", inputMode: "numeric", autocomplete: "off", size: 9, disabled: role !== "operator" });
   const said = h("p", { class: "quiet", role: "status" });
   let offset = NaN;
-  const use = h("button", { type: "button", hidden: true, onclick: () => act(() => order("PUT", "/api/v1/clock", { offset_s: offset, uncertainty_s: UNCERTAINTY_S })) }, "Use this");
+  const use = h("button", { type: "button", hidden: true, onclick: () => act(() => order("PUT", "api/v1/clock", { offset_s: offset, uncertainty_s: UNCERTAINTY_S })) }, "Use this");
   const compare = h("button", {
     type: "button", disabled: role !== "operator",
     onclick: () => {
@@ -71,7 +71,7 @@ export const drawScannerClock = whenChanged(({ clock, clock_implies, role }) => 
   }, "It shows this now");
   const forget = h("button", {
     type: "button", disabled: role !== "operator", title: "Slices wait until the clocks are compared again.",
-    onclick: () => act(() => order("POST", "/api/v1/clock/reset", { why: "said on the page" })),
+    onclick: () => act(() => order("POST", "api/v1/clock/reset", { why: "said on the page" })),
   }, "It was set anew: forget this");
   replace(byId("scanner-clock"), h("p", { class: "quiet" }, ...known),
     h("p", {}, h("label", { htmlFor: "scanner-shows" }, "The scanner shows "), input, " ", compare), said, use, clock ? h("p", {}, forget) : null);

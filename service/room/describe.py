@@ -78,7 +78,7 @@ class Describer:
                 "ready": arrival is not None,
                 "arrival": arrival,
                 "punctured": arrival is not None and _punctured(record, arrival.procedure_id),
-                "robot": _robot(link, before.robot),
+                "robot": describe_robot(link, before.robot),
                 "jog_possible": may_start(record, link.status) is None,
                 "hold": _hold(record),
                 **_slices(record),
@@ -128,7 +128,8 @@ def _condition(seen: bool, running: bool, beat_age_s: float) -> dict[str, str]:
     return {"condition": "up", "detail": ""}
 
 
-def _robot(link: RoomLink, before: RobotState) -> RobotState:
+def describe_robot(link: RoomLink, before: RobotState) -> RobotState:
+    """The bridge as it last said it was; without a link as it was, and that it is not linked."""
     status = link.status
     if status is None:
         return before.model_copy(update={"linked": False, "problem": link.problem})

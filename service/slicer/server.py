@@ -12,17 +12,19 @@ import asyncio
 import contextlib
 import ipaddress
 import socket
-import sqlite3
 from pathlib import Path
 
 import structlog
 
-from case_record.connection import CaseRecordError
 from case_record.record import CaseRecord
 from room_config.load import ConfigError
+from room_config.networks import address_of
 from room_config.openigtlink import OpenIgtLinkConfig
-from service.room.control import ControlLoop
-from service.slicer.scene import Images, Scene, scene_of
+from room_config.service import GuideConfig
+from service.room.control import STALE_S, ControlLoop
+from service.room.state import RoomState
+from service.slicer.messages import Message
+from service.slicer.scene import Images, Scene, scene_of, stale_scene
 
 _LOOK_S = 0.05
 _STATUS_EVERY_S = 1.0
@@ -58,12 +60,15 @@ class OpenIgtLinkServer:
         case_dir: Path,
         loop: ControlLoop,
         listening: socket.socket,
+        guide: GuideConfig | None = None,
     ) -> None:
+        """guide: of a room with two fiducials."""
         self._listening = listening
         self._config = config
         self._case_dir = case_dir
         self._loop = loop
         self._networks = [ipaddress.ip_network(text) for text in config.peer_networks]
+        self._guide = guide
         self._images = Images()
         self._scene: Scene = {}
         self._changed = asyncio.Condition()
@@ -95,19 +100,20 @@ class OpenIgtLinkServer:
             if not self.receivers or not (due or state.revision != revision):
                 continue
             revision, told_s = state.revision, now_s()
-            scene = scene_of(state)
+            # what the room no longer says is not sent as what it does now
+            is_stale = self._loop.state_age_s > STALE_S
+            scene = stale_scene(state) if is_stale else scene_of(state, self._guide)
             try:
-                scene |= await asyncio.to_thread(self._images_of_state)
-            except (CaseRecordError, sqlite3.Error, OSError, ValueError) as error:
+                scene |= await asyncio.to_thread(self._images_of, state)
+            except Exception as error:
                 log.warning("scene without images", reason=str(error))
             async with self._changed:
                 self._scene = scene
                 self._changed.notify_all()
 
-    def _images_of_state(self) -> Scene:
-        state = self._loop.state
+    def _images_of(self, state: RoomState) -> Scene:
         if not state.case_uid:
-            return {}
+            return self._images.of(state, None)
         with CaseRecord(self._case_dir) as record:
             return self._images.of(state, record)
 
@@ -135,9 +141,7 @@ class OpenIgtLinkServer:
             writer.transport.abort()
 
     def _why_not(self, peer: str) -> str:
-        if self._networks and not any(
-            ipaddress.ip_address(peer) in network for network in self._networks
-        ):
+        if self._networks and not any(address_of(peer) in network for network in self._networks):
             return "its address is not in openigtlink.peer_networks"
         if self.receivers >= self._config.max_receivers:
             return f"{self.receivers} are connected already"
@@ -149,11 +153,25 @@ class OpenIgtLinkServer:
             async with self._changed:
                 await self._changed.wait()
                 scene = self._scene
-            for device, encoded in scene.items():
-                if sent.get(device) != encoded:
-                    writer.write(encoded)
+            for device, message in scene.items():
+                if _is_news(message, sent.get(device)):
+                    writer.write(message.encoded(_version_for(message)))
                     await asyncio.wait_for(writer.drain(), _PATIENCE_S)
             sent = scene
+
+
+def _is_news(message: Message, sent: Message | None) -> bool:
+    """Whether a receiver lacks it; that time went on is news for STATUS and images only."""
+    if message.kind in ("STATUS", "IMAGE"):
+        return message.kind == "STATUS" or message != sent
+    if sent is None:
+        return message.kind == "POINT" or not message.withdraws
+    return (message.content, message.meta) != (sent.content, sent.meta)
+
+
+def _version_for(message: Message) -> int:
+    """All read version 1; that something ended can be said in version 2 only."""
+    return 2 if message.withdraws else 1
 
 
 async def _read_to_end(reader: asyncio.StreamReader) -> None:

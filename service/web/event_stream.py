@@ -1,4 +1,4 @@
-"""Server-sent events: the state whenever it changes, each new event of the record, a beat a second.
+"""Server-sent events: the state when it changes, each new event of the record, and often a beat.
 
 One thread watches the control loop and encodes once; the viewers only pass bytes on and have no
 timers of their own, so that many of them cost little. `id:` is the record's event id; a client that
@@ -17,14 +17,14 @@ from collections.abc import AsyncIterator
 
 import structlog
 
-from case_record.record import CaseRecord, CaseRecordError
+from case_record.record import CaseRecord
 from case_record.rows import Event
 from room_config.load import Config
 from service.room.control import ControlLoop
 
 _WATCH_S = 0.01
 _LEAST_BETWEEN_STATES_S = 0.04
-_BEAT_S = 1.0
+_BEAT_S = 0.3
 _AGAIN_S = 1.0
 _KEPT_EVENTS = 1000
 _EVENTS_AT_ONCE = 100
@@ -62,8 +62,8 @@ class Broadcast:
         while not self._closing.is_set():
             try:
                 self._watch_record()
-            except CaseRecordError as error:
-                structlog.get_logger().error("event stream", error=str(error))
+            except Exception as error:  # whatever it is, the screens must go on being told
+                structlog.get_logger().exception("event stream", error=str(error))
                 self._beat_if_due()
                 self._closing.wait(_AGAIN_S)
 
@@ -93,7 +93,9 @@ class Broadcast:
         """Tells how old the state is: a control loop that hangs is noticed on every screen."""
         if time.monotonic() - self._told_s < _BEAT_S:
             return
-        body = json.dumps({"at_s": self._loop.state.at_s, "now_s": time.time()})
+        loop = self._loop
+        told = {"at_s": loop.state.at_s, "now_s": time.time(), "age_s": round(loop.state_age_s, 3)}
+        body = json.dumps(told)
         self._tell(None, [], f"event: beat\ndata: {body}\n\n".encode())
 
     def _tell(

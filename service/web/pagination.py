@@ -24,4 +24,5 @@ def link_onward(request: Request, response: Response, ids: list[int], limit: int
     """Name the next page in the `Link` header, if this one is full."""
     if len(ids) == limit:
         onward = request.url.include_query_params(after=ids[-1])
-        response.headers["Link"] = f'<{onward.path}?{onward.query}>; rel="next"'
+        path = f"{request.state.prefix}{onward.path}"
+        response.headers["Link"] = f'<{path}?{onward.query}>; rel="next"'

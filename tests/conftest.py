@@ -1,0 +1,1 @@
+"""Its folder is where every test finds `real_slices`."""
