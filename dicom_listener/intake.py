@@ -334,7 +334,7 @@ class Intake:
             decision = self._assign(slice_, row.received_s, [*earlier, *later])
             state, hold_id, code, text = outcome_of(decision)
             self._note_clockless(slice_id, code)
-            if (state, code) == (row.state, row.reason_code):
+            if (state, code, text) == (row.state, row.reason_code, row.reason):
                 continue
             self._decide(row, decision, (state, hold_id, code, text))
 

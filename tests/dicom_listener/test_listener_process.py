@@ -167,7 +167,7 @@ def test_a_scanner_clock_set_forward_stops_assignment_until_the_clocks_are_compa
         assert (waiting.state, waiting.reason_code) == ("pending", "clock_unknown")
         assert "ahead of the comparison: compare the clocks, or confirm" in waiting.reason
         sync_clock(record, -30.0, 0.1, "anna")
-        wait_for(lambda: record.slices()[2].state == "assigned")
+        wait_for(lambda: "before the scanner's clock was set" in record.slices()[2].reason)
 
 
 def test_a_slice_that_seems_minutes_late_is_set_aside_with_an_alarm(tmp_path):
@@ -246,7 +246,7 @@ def test_after_the_clock_was_set_what_was_acquired_before_may_not_be_told_from_w
         new = mr_data_set("1.2.2", began_s=time.time() - 60.6)
         new.AcquisitionNumber = 2
         send(listener.port, of_before, new)
-        assert {row.state for row in rows(record, 2)} == {"quarantined"}
+        assert {row.state for row in rows(record, 2)} == {"pending"}
 
 
 def test_in_arrival_mode_a_confirmed_acquisition_needs_no_time(tmp_path):

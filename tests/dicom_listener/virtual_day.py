@@ -31,6 +31,7 @@ from dicom_slice.header import Slice
 from dicom_slice.times import AcquisitionInterval
 
 _LONGEST_DELAY_S = 300.0
+DELAYS = ("regular", "varied", "any", "series")
 KNOWLEDGE = ("comparison", "promptness", "both", "neither")
 
 
@@ -256,9 +257,7 @@ class VirtualDay:
     def decide(self, arrival: Arrival, number: int) -> None:
         known = [k for key, k in self.known.items() if key < number or k.hold_id is not None]
         bounds = self.bounds_of(arrival)
-        decision = assign(
-            arrival.slice, arrival.received_s, self.holds, known, bounds, self.rules
-        )
+        decision = assign(arrival.slice, arrival.received_s, self.holds, known, bounds, self.rules)
         hold_id, code = None, ""
         if isinstance(decision, Assigned):
             hold_id = decision.hold_id
