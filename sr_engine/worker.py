@@ -6,6 +6,7 @@ is recorded as failed, with the reason.
 
 from __future__ import annotations
 
+import contextlib
 import math
 import sqlite3
 import time
@@ -19,9 +20,10 @@ import structlog
 from numpy.typing import NDArray
 
 from case_record.attempts import MOST_DEATHS, Attempts
+from case_record.cases import Cases
 from case_record.connection import json_text
 from case_record.presence import Presence
-from case_record.record import CaseRecord
+from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Measurement, SliceRow
 from dicom_slice.geometry import SliceGeometry
 from dicom_slice.pixels import magnitude_pixels
@@ -41,7 +43,7 @@ from sr_engine.localize import SEARCH_PX, localize
 from sr_engine.paper import PaperMethod, PaperSettings, localize_paper
 from sr_engine.psf import Psf
 from sr_engine.recognise import psf_of_noise
-from sr_engine.reconstruct import reconstruct
+from sr_engine.reconstruction.reconstruct import reconstruct
 
 IMAGES = "images"
 ALIVE = "worker.alive"
@@ -94,30 +96,44 @@ class PointSpreads:
 
 
 def serve(config: Config, should_stop: Callable[[], bool]) -> None:
-    """Work until `should_stop`; looks for requests every `poll_s`, says every second: alive.
+    """Work until `should_stop` on whatever case is open; says every second: alive.
 
     While the record cannot be read or written it is tried again: the requests stand in it.
     """
-    case_dir = config.room.case_dir
+    cases = Cases(*config.room.folders)
     psfs = PointSpreads(config.imaging.point_spread)
-    with (
-        CaseRecord(case_dir, create=True) as record,
-        Presence(case_dir, "worker") as presence,
-        Attempts(case_dir, "worker") as attempts,
-    ):
-        said_s = 0.0
-        while not should_stop():
+    with Presence(cases.home, "worker") as presence:
+        told_s = 0.0
+
+        def alive() -> bool:
+            nonlocal told_s
+            presence.beat()
+            if time.monotonic() - told_s > 1.0:
+                told_s = time.monotonic()
+                with contextlib.suppress(OSError):  # a disk that takes nothing
+                    (cases.home / ALIVE).touch()
+            time.sleep(config.worker.poll_s)
+            return not should_stop()
+
+        while alive():
             try:
-                presence.beat()
-                if time.monotonic() - said_s > 1.0:
-                    said_s = time.monotonic()
-                    (case_dir / ALIVE).touch()
-                for request in record.requested_measurements():
-                    attempt(record, request, config.worker.reconstruction_factor, psfs, attempts)
-            except (sqlite3.Error, OSError) as error:
+                case_dir = cases.open
+                if case_dir is not None:
+                    _work_on(case_dir, cases, config, psfs, alive)
+            except (CaseRecordError, sqlite3.Error, OSError) as error:
                 log.error("the case record cannot be used", error=str(error))
                 time.sleep(_RECORD_RETRY_S)
-            time.sleep(config.worker.poll_s)
+
+
+def _work_on(
+    case_dir: Path, cases: Cases, config: Config, psfs: PointSpreads, alive: Callable[[], bool]
+) -> None:
+    """Answer the requests of one case for as long as it is the open one."""
+    factor = config.worker.reconstruction_factor
+    with CaseRecord(case_dir, create=True) as record, Attempts(case_dir, "worker") as attempts:
+        while alive() and cases.open == case_dir:
+            for request in record.requested_measurements():
+                attempt(record, request, factor, psfs, attempts)
 
 
 def attempt(

@@ -14,6 +14,8 @@ import structlog
 import typer
 import uvicorn
 
+from case_record.cases import Cases
+from case_record.presence import Sole
 from room_config.load import Config, ConfigError, load_config
 from room_config.networks import with_mapped
 from room_config.shell import announce, configure_logs, on_parent_gone
@@ -30,12 +32,18 @@ _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> None:
     """Page, API, procedure, planner."""
+    configure_logs()
+    room = load_config(config)
+    cases = Cases(*room.room.folders)
+    with Sole(cases.home, "service"):
+        _serve(room, cases, exit_with_parent)
+
+
+def _serve(room: Config, cases: Cases, exit_with_parent: bool) -> None:
     from service.room.control import ControlLoop
     from service.slicer.server import OpenIgtLinkServer, bind_openigtlink
     from service.web.app import create_app
 
-    configure_logs()
-    room = load_config(config)
     check_device(room.service.bridge_link)
     listening = bind(room)
     host, port = listening.getsockname()[:2]
@@ -48,8 +56,7 @@ def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> Non
 
     def scene(loop: ControlLoop) -> OpenIgtLinkServer:
         assert followers is not None
-        guide = room.service.guide
-        return OpenIgtLinkServer(room.openigtlink, room.room.case_dir, loop, followers, guide)
+        return OpenIgtLinkServer(room, cases, loop, followers)
 
     failed = threading.Event()
 

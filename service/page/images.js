@@ -3,9 +3,9 @@
 import { getPixels, order } from "./api.js";
 import { h, replace, s, setText, whenChanged } from "./dom.js";
 import { ellipse, patientFromPixel, pixelFromPatient } from "./geometry.js";
-import { act, arrow } from "./next.js";
+import { act, arrow } from "./actions.js";
 import { natural, SliceView } from "./slice_view.js";
-import { age, clock } from "./words.js";
+import { age, clock } from "./format.js";
 
 const LAYOUTS = [["slice", "Slice"], ["both", "Both"], ["reconstruction", "Reconstruction"], ["blend", "Blended"]];
 const NUDGE_MM = 0.1;

@@ -2,8 +2,8 @@
 
 import { get, order } from "./api.js";
 import { byId, h, replace, whenChanged } from "./dom.js";
-import { act } from "./next.js";
-import { clock, day, mm, plain } from "./words.js";
+import { act } from "./actions.js";
+import { clock, day, mm, plain } from "./format.js";
 
 const MOST_EVENTS = 200;
 

@@ -3,12 +3,12 @@
 
 import { order } from "./api.js";
 import { byId, h, replace, setText, whenChanged } from "./dom.js";
-import { act } from "./next.js";
-import { age, day } from "./words.js";
+import { act } from "./actions.js";
+import { age, day } from "./format.js";
 
 const DAY_S = 86400;
-// a person presses within this of the second that is shown (1 sigma of eye and hand, and its rounding)
-const UNCERTAINTY_S = 0.5;
+// a person presses within this of the second that is shown: its rounding, and the time to react
+const UNCERTAINTY_S = 1.0;
 
 const heardS = [];
 

@@ -17,6 +17,7 @@ from typing import Any
 
 import structlog
 
+from case_record.cases import Cases
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Procedure
 from room_config.load import Config
@@ -60,6 +61,9 @@ _WHILE_MOVING = frozenset(
         "confirm_acquisition",
         "give_up_slices",
         "set_entry",
+        "propose",
+        "refuse_proposal",
+        "note_registration",
     }
 )
 log = structlog.get_logger()
@@ -89,6 +93,7 @@ class ControlLoop:
         on_failure: called, in the loop's thread, when the loop has ended by itself.
         """
         self._config = config
+        self._cases = Cases(*config.room.folders)
         self._link = link
         self._others_wrong = others_wrong
         self._link.client.while_moving = self._while_moving
@@ -168,7 +173,7 @@ class ControlLoop:
     def _work_until_it_fails(self) -> None:
         try:
             with CaseRecord(
-                self._config.room.case_dir, create=True, busy_timeout_s=_BUSY_TIMEOUT_S
+                self._cases.required(), create=True, busy_timeout_s=_BUSY_TIMEOUT_S
             ) as record:
                 self._serve(record)
         except _Closing:

@@ -21,6 +21,7 @@ from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.registry import Collector
 
+from case_record.cases import Cases
 from room_config.load import Config
 from service.dicom_out.outbox_watch import OutboxWatch
 from service.room.control import STALE_S, ControlLoop
@@ -37,6 +38,7 @@ from service.web.routes.images import measurement_image_router, slice_image_rout
 from service.web.routes.live import live_router
 from service.web.routes.outputs import outbox_router, output_router
 from service.web.routes.procedure import procedure_router
+from service.web.routes.proposals import proposal_router
 from service.web.routes.record import event_router, measurement_router, slice_router
 from service.web.routes.record_edits import clerk_router
 from service.web.routes.robot import robot_router, stop_router
@@ -104,20 +106,22 @@ def create_app(
     access = Access(access_rules(config))
     app.add_middleware(Gate, access=access, uses_tls=uses_tls, public_url=service.public_url)
     add_problems(app)
-    case_dir, orders = config.room.case_dir, Orders(loop)
+    app.state.cases = Cases(*config.room.folders)
+    orders = Orders(loop)
     for router in (
         stop_router(loop),
         live_router(loop, broadcast),
-        event_router(case_dir),
-        slice_router(case_dir),
-        measurement_router(case_dir),
-        slice_image_router(case_dir),
-        measurement_image_router(case_dir),
-        output_router(case_dir),
+        event_router(),
+        slice_router(),
+        measurement_router(),
+        slice_image_router(),
+        measurement_image_router(),
+        output_router(),
         outbox_router(config),
-        document_router(case_dir),
+        document_router(),
         robot_router(orders),
         target_router(orders),
+        proposal_router(orders),
         procedure_router(orders),
         clerk_router(orders),
         access_router(access, cookie_path=urlsplit(service.public_url).path or "/"),

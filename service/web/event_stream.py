@@ -17,6 +17,7 @@ from collections.abc import AsyncIterator
 
 import structlog
 
+from case_record.cases import Cases
 from case_record.record import CaseRecord
 from case_record.rows import Event
 from room_config.load import Config
@@ -34,7 +35,7 @@ class Broadcast:
     """`start` it in the server's event loop, `close` it at the end; each viewer gets `follow`."""
 
     def __init__(self, config: Config, loop: ControlLoop) -> None:
-        self._case_dir = config.room.case_dir
+        self._cases = Cases(*config.room.folders)
         self._loop = loop
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="broadcast", daemon=True)
@@ -72,7 +73,7 @@ class Broadcast:
             if self._closing.wait(_WATCH_S):
                 return
             self._beat_if_due()
-        with CaseRecord(self._case_dir) as record:
+        with CaseRecord(self._cases.required()) as record:
             if not self._newest_id:
                 self._newest_id = max(0, record.last_event_id() - _KEPT_EVENTS)
             revision = -1
@@ -178,7 +179,7 @@ class Broadcast:
     def _recorded(self, after_id: int) -> tuple[bytes, int]:
         if not self._loop.state.case_uid:
             return b"", after_id
-        with CaseRecord(self._case_dir) as record:
+        with CaseRecord(self._cases.required()) as record:
             events = record.events(after_id, _EVENTS_AT_ONCE)
         if not events:
             return b"", after_id

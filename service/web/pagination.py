@@ -16,8 +16,8 @@ After = Annotated[
 ]
 Limit = Annotated[int, Query(ge=1, le=1000)]
 Newest = Annotated[bool, Query(description="The newest first instead of the oldest first.")]
-ERRORS = responses(401, 422, 429)
-ERRORS_WITH_ID = responses(401, 404, 422, 429)
+ERRORS = responses(401, 404, 409, 422, 429)  # of no such case, of none that is open
+ERRORS_WITH_ID = ERRORS
 
 
 def link_onward(request: Request, response: Response, ids: list[int], limit: int) -> None:

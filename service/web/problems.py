@@ -18,6 +18,7 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
+from case_record.cases import CasesError, NoCaseError
 from case_record.record import CaseRecordError, RecordUnavailableError
 from service.room.images import ImageMissingError
 from service.room.readiness import ConflictError
@@ -91,6 +92,14 @@ def add_problems(app: FastAPI) -> None:
     @app.exception_handler(ConflictError)
     async def conflict(_: Request, error: ConflictError) -> JSONResponse:
         return problem(409, error.code, str(error))
+
+    @app.exception_handler(NoCaseError)
+    async def no_case(_: Request, error: NoCaseError) -> JSONResponse:
+        return problem(409, "no_case", str(error))
+
+    @app.exception_handler(CasesError)
+    async def cases(_: Request, error: CasesError) -> JSONResponse:
+        return problem(409, "cases", str(error))
 
     @app.exception_handler(CaseRecordError)
     async def unknown(_: Request, error: CaseRecordError) -> JSONResponse:

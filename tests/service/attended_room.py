@@ -14,7 +14,7 @@ import numpy as np
 from room_config.shell import autospine
 from service.client import RoomClient, ServiceGoneError
 from service.room.state import RoomState
-from simulator.demo_room import DemoOptions, DemoRoom
+from simulator.demo.room import DemoOptions, DemoRoom
 from simulator.truth_client import TruthAddress, ask_path
 
 Seen = TypeVar("Seen")

@@ -8,7 +8,7 @@ import urllib.request
 import pytest
 
 from case_record.record import CaseRecord
-from simulator.demo_room import known_faults
+from simulator.demo.room import known_faults
 from simulator.misassigned import misassigned, read_truth
 
 PROCESSES = {

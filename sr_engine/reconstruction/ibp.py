@@ -20,10 +20,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import sparse
 
-from sr_engine.blur import Blur
 from sr_engine.errors import ParameterError
 from sr_engine.frames import check_factor, check_frames_and_shifts
-from sr_engine.interpolate import fine_from_frame
+from sr_engine.reconstruction.blur import Blur
+from sr_engine.reconstruction.interpolate import fine_from_frame
 
 Image = NDArray[np.float64]
 Observer = Callable[[int, float], None]

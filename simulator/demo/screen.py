@@ -11,7 +11,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from simulator.demo_operator import Operator, PunctureResult
+from simulator.demo.operator import Operator, PunctureResult
 
 
 class DemoScreen:

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from sr_engine.blur import Blur
 from sr_engine.errors import ParameterError
-from sr_engine.fourier import Prior, prepare_filters
 from sr_engine.frames import Region, check_factor, check_frames_and_shifts, whole
-from sr_engine.ibp import Observer, Stopping, reconstruct_ibp
-from sr_engine.interpolate import fine_from_frame, frame_from_fine
-from sr_engine.shiftset import (
+from sr_engine.reconstruction.blur import Blur
+from sr_engine.reconstruction.fourier import Prior, prepare_filters
+from sr_engine.reconstruction.ibp import Observer, Stopping, reconstruct_ibp
+from sr_engine.reconstruction.interpolate import fine_from_frame, frame_from_fine
+from sr_engine.reconstruction.shiftset import (
     MAX_CONDITION_NUMBER,
     condition_number,
     noise_factor,

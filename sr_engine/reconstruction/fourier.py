@@ -24,10 +24,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import fft
 
-from sr_engine.blur import Blur
 from sr_engine.errors import ParameterError
 from sr_engine.frames import check_factor, check_frames_and_shifts, check_shifts
-from sr_engine.shiftset import MAX_CONDITION_NUMBER, require_regular
+from sr_engine.reconstruction.blur import Blur
+from sr_engine.reconstruction.shiftset import MAX_CONDITION_NUMBER, require_regular
 
 Complex = NDArray[np.complex128]
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from room_config.exit_codes import COULD_NOT
 from service.client import RefusedByServiceError, RoomClient, ServiceGoneError
 from simulator.config import VirtualRoom
 from simulator.scene import true_fiducial_mm, true_guide
@@ -36,7 +37,7 @@ _CLOCK_READING_S = 0.02
 class DemoFailedError(Exception):
     """The room could not do its job; the text says why."""
 
-    exit_code = 3
+    exit_code = COULD_NOT
 
 
 @dataclass(frozen=True)

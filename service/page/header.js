@@ -1,7 +1,7 @@
 // The top line: work phase, link lights, banners, clock.
 
 import { byId, h, replace, setHidden, setText, whenChanged } from "./dom.js";
-import { age, plain } from "./words.js";
+import { age, plain } from "./format.js";
 
 const PHASES = ["START_UP", "CALIBRATION", "PLANNING", "TARGETING", "MOVE_TO_TARGET", "MANUAL"];
 const ALARM_PHASES = ["STOP", "EMERGENCY"];

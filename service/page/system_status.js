@@ -2,7 +2,7 @@
 
 import { getText } from "./api.js";
 import { byId, h, replace, setText, whenChanged } from "./dom.js";
-import { plain } from "./words.js";
+import { plain } from "./format.js";
 
 const EVERY_MS = 5000;
 const COUNTED = [

@@ -2,7 +2,7 @@
 
 import { byId, h, replace, s, setText, whenChanged } from "./dom.js";
 import { ellipse, inWords } from "./geometry.js";
-import { mm, NONE, percent } from "./words.js";
+import { mm, NONE, percent } from "./format.js";
 
 const SIGMAS = 2;
 

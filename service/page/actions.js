@@ -3,7 +3,7 @@
 import { order } from "./api.js";
 import { byId, h, replace, s, setText, whenChanged } from "./dom.js";
 import { inWords } from "./geometry.js";
-import { mm, signedMm } from "./words.js";
+import { mm, signedMm } from "./format.js";
 
 // A plan that has just appeared must be read before it can be confirmed: no accidental double click.
 const READ_FIRST_MS = 700;

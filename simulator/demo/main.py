@@ -18,16 +18,16 @@ import typer
 from rich.console import Console
 
 from case_record.record import CaseRecord
+from room_config.exit_codes import BAD_INPUT, COULD_NOT, INTERRUPTED
 from service.cli.children import ChildError, quiet_environment
 from service.client import RoomClient
 from simulator.config import parse_virtual_room
-from simulator.demo_operator import WHO, DemoFailedError, Operator
-from simulator.demo_room import DemoOptions, DemoRoom, known_faults
-from simulator.demo_screen import DemoScreen, final_table
+from simulator.demo.operator import WHO, DemoFailedError, Operator
+from simulator.demo.room import DemoOptions, DemoRoom, known_faults
+from simulator.demo.screen import DemoScreen, final_table
 from simulator.truth_client import TruthAddress
 from simulator.unintended import ask_motions, unintended_motions
 
-BAD_INPUT, COULD_NOT, INTERRUPTED = 2, 3, 130
 app = typer.Typer(add_completion=False)
 
 
