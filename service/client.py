@@ -223,6 +223,15 @@ class RoomClient:
     def choose_target(self, number: int) -> None:
         self._order("POST", f"/api/v1/targets/{number}/choose")
 
+    def take_proposal(self, number: int, *, in_water: bool, label: str = "") -> None:
+        """Make what a planning station proposes the target; in_water: a place in tissue."""
+        path = f"/api/v1/proposals/{number}/take"
+        self._order("POST", path, in_water=in_water, label=label)
+
+    def refuse_proposal(self, number: int, why: str = "") -> None:
+        """Say no to what a planning station proposes; it is told why."""
+        self._order("POST", f"/api/v1/proposals/{number}/refuse", why=why)
+
     def set_entry(self, patient_mm: Sequence[float]) -> None:
         self._order("PUT", "/api/v1/entry", patient_mm=list(patient_mm))
 

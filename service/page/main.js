@@ -9,6 +9,7 @@ import { addEvent, drawAlarms, drawAside, drawCase, drawJog, drawPast, drawTarge
 import { Live } from "./live.js";
 import { askForToken, leave, whoAmI } from "./login.js";
 import { act, Next } from "./actions.js";
+import { drawProposals } from "./proposals.js";
 import { drawParts, keepCounting } from "./system_status.js";
 import { drawScannerClock, heardFromRoom } from "./scanner_clock.js";
 import { drawNumbers } from "./distance.js";
@@ -28,6 +29,7 @@ function draw(state) {
   drawNumbers({ error: state.error, measurement: state.measurement, tolerance_mm: state.tolerance_mm, arrival: state.arrival, slice: state.slice, guide: state.guide });
   drawStages({ robot: { travel_um: robot.travel_um, positions_um: robot.positions_um, position_certain: robot.position_certain }, plan: question?.plan });
   drawAlarms(state.alarms ?? []);
+  drawProposals({ proposals: state.proposals ?? [], role: page.role });
   drawJog({ positions_um: robot.positions_um, possible: page.role === "operator" && state.jog_possible });
   drawCase({ description: state.case, case_uid: state.case_uid, role: page.role });
   drawScannerClock({ clock: state.clock, role: page.role });
