@@ -14,7 +14,7 @@ from case_record.record import CaseRecord
 from case_record.rows import Measurement
 from service.client import RoomClient
 from service.room.state import RoomState
-from simulator.demo_room import DemoRoom
+from simulator.demo.room import DemoRoom
 
 _TARGETS_MM = ((0.6, 0.0, 0.5), (-0.4, 0.0, -0.6), (0.2, 0.0, 0.7), (-0.7, 0.0, 0.3))
 _PATIENCE_S = 300.0

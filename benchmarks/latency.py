@@ -25,7 +25,7 @@ from _viewers import viewers
 from numpy.typing import NDArray
 
 from service.client import RoomClient
-from simulator.demo_room import DemoOptions
+from simulator.demo.room import DemoOptions
 
 _VIEWERS = 50
 _QUICK_SLICES, _FULL_SLICES = 32, 400

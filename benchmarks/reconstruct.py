@@ -23,11 +23,11 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from sr_engine import shiftset
-from sr_engine.fourier import prepare_filters
-from sr_engine.ibp import PAPER, Stopping, reconstruct_ibp
 from sr_engine.psf import Psf
-from sr_engine.reconstruct import reconstruct
+from sr_engine.reconstruction import shiftset
+from sr_engine.reconstruction.fourier import prepare_filters
+from sr_engine.reconstruction.ibp import PAPER, Stopping, reconstruct_ibp
+from sr_engine.reconstruction.reconstruct import reconstruct
 from sr_engine.simulate import render_disc, rician
 
 Array = NDArray[np.float64]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sqlite3
 from collections.abc import Iterator
@@ -21,27 +22,46 @@ class CaseRecordError(Exception):
     exit_code = 2
 
 
+class RecordUnavailableError(CaseRecordError):
+    """The record cannot be opened now: locked by another, a full disk, a mount that is gone."""
+
+    exit_code = 3
+
+
 class Connection:
     """What every part of the record stands on. Use it in the thread that opened it.
 
     read_only: nothing is written, not even a migration; a record of another schema is refused.
+    busy_timeout_s: so long a statement waits for another writer before it is an error.
     """
 
-    def __init__(self, case_dir: Path, *, create: bool = False, read_only: bool = False) -> None:
+    def __init__(
+        self,
+        case_dir: Path,
+        *,
+        create: bool = False,
+        read_only: bool = False,
+        busy_timeout_s: float = _BUSY_TIMEOUT_S,
+    ) -> None:
         self.case_dir = Path(case_dir)
         path = self.case_dir / FILE_NAME
         if create:
-            self.case_dir.mkdir(parents=True, exist_ok=True)
+            self.case_dir.mkdir(parents=True, exist_ok=True, mode=0o700)
         elif not path.is_file():
             raise CaseRecordError(f"{self.case_dir}: no case record ({FILE_NAME}) in this folder")
+        if create:
+            _for_its_owner_alone(self.case_dir, path)
         where = _read_only_uri(path) if read_only else path.absolute().as_uri()
-        self._db = sqlite3.connect(where, timeout=_BUSY_TIMEOUT_S, isolation_level=None, uri=True)
+        self._db = sqlite3.connect(where, timeout=busy_timeout_s, isolation_level=None, uri=True)
         self._db.row_factory = sqlite3.Row
         try:
             if read_only:
                 self._check_schema()
             else:
                 self._prepare()
+        except sqlite3.OperationalError as error:
+            self._db.close()
+            raise RecordUnavailableError(f"{path}: {error}") from error
         except sqlite3.DatabaseError as error:
             self._db.close()
             raise CaseRecordError(f"{path}: not a usable case record ({error})") from error
@@ -108,6 +128,17 @@ class Connection:
     def change_count(self) -> tuple[int, int]:
         """As `data_version`, and a number that also changes with what this connection wrote."""
         return self.data_version(), self._db.total_changes
+
+
+def _for_its_owner_alone(case_dir: Path, path: Path) -> None:
+    """Patient data: nobody else may read what is in the folder, or was made by an older program."""
+    with contextlib.suppress(OSError):  # not ours to change, or a disk that takes nothing
+        if case_dir.stat().st_mode & 0o077:
+            case_dir.chmod(0o700)
+        if not path.exists():
+            path.touch(0o600)
+        elif path.stat().st_mode & 0o077:
+            path.chmod(0o600)
 
 
 def _read_only_uri(path: Path) -> str:

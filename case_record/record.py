@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 import uuid
 
-from case_record.connection import FILE_NAME, CaseRecordError
+from case_record.connection import FILE_NAME, CaseRecordError, RecordUnavailableError
 from case_record.events import Events
 from case_record.holds import Holds
 from case_record.measurements import Measurements
@@ -20,7 +20,7 @@ from case_record.procedures import Procedures
 from case_record.rows import Case
 from case_record.slices import Slices
 
-__all__ = ["FILE_NAME", "CaseRecord", "CaseRecordError"]
+__all__ = ["FILE_NAME", "CaseRecord", "CaseRecordError", "RecordUnavailableError"]
 
 
 class CaseRecord(Events, Holds, Slices, Measurements, Procedures, Moves):

@@ -12,6 +12,7 @@ A slice is assigned to a hold only if all of this holds; one missing proof sets 
    as it lacks are set aside before one is believed: they may be the missing ones.
 5. Geometry. It shows the same slice positions as the other holds of its set, on the same grid.
 6. Count. The hold still lacks slices.
+7. Identity. It is of the patient, study and frame of reference to which the case is bound.
 
 In arrival mode (a site without usable acquisition times) the operator's confirmation that the
 acquisition was made at this hold takes the place of 1.
@@ -22,6 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from dicom_listener.belonging import Binding, why_not_of
 from dicom_listener.clock import OffsetBounds
 from dicom_slice.geometry import SliceGeometry
 from dicom_slice.header import Slice
@@ -105,11 +107,16 @@ def assign(
     known: Sequence[Known],
     offset: OffsetBounds | None,
     rules: AssignRules,
+    binding: Binding | None = None,
 ) -> Decision:
     """Decide for one usable slice (`why_not_usable` said None).
 
     holds: all of the case, in their order; known: usable slices received before, oldest first.
+    binding: of the case; None: as the first used one of the known slices binds it.
     """
+    other = why_not_of(binding or _bound_by(known), slice_)
+    if other is not None:
+        return Quarantined(other.code, other.text)
     if not any(hold.was_open_at(received_s) for hold in holds) and not holds:
         return Quarantined(Reason.NO_HOLD, "no hold was open: the robot had not settled yet")
     placed = _by_arrival if rules.arrival_mode else _by_time
@@ -127,6 +134,11 @@ def assign(
     if doubt is not None:
         return doubt
     return _surplus(hold, known) or assigned
+
+
+def _bound_by(known: Sequence[Known]) -> Binding | None:
+    first = next((one for one in known if one.hold_id is not None), None)
+    return None if first is None else Binding.of_slice(first.slice)
 
 
 # 1 and 2: time and receipt

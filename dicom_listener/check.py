@@ -8,6 +8,7 @@ from pathlib import Path
 
 from pynetdicom import AE
 
+from case_record.cases import Cases
 from dicom_listener.inbox import Envelope, Inbox, is_whole, sha256_of
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.negotiation import VERIFICATION
@@ -24,7 +25,7 @@ Result = tuple[str, bool, str]
 def self_check(config: Config) -> list[Result]:
     """Return (what, passed, in words). Raises ConfigError where the configuration is no good."""
     intake_rules(config, time.time())
-    folder = inbox_folder(config.room.case_dir)
+    folder = inbox_folder(Cases(*config.room.folders).home)
     return [_disk(config, folder), _write(folder), _clock(), _echo(config)]
 
 

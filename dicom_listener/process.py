@@ -12,6 +12,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import structlog
 
+from case_record.cases import Cases
 from case_record.presence import Presence, Sole
 from case_record.record import CaseRecord
 from dicom_listener.assign import AssignRules
@@ -131,10 +132,11 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
     received: SimpleQueue[Path] = SimpleQueue()
     metrics = ListenerMetrics()
     with ExitStack() as stack:
-        stack.enter_context(Sole(config.room.case_dir, "listener"))
-        record = stack.enter_context(CaseRecord(config.room.case_dir, create=True))
+        case_dir = Cases(*config.room.folders).required()
+        stack.enter_context(Sole(case_dir, "listener"))
+        record = stack.enter_context(CaseRecord(case_dir, create=True))
         inbox = Inbox(
-            inbox_folder(config.room.case_dir),
+            inbox_folder(case_dir),
             min_free_bytes=config.listener.min_free_mib * _MIB,
         )
         rules = intake_rules(config, time.time())
@@ -159,7 +161,7 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         for path in left_over:
             received.put(path)
         log.info("serving", port=scp.port, left_over=len(left_over))
-        presence = stack.enter_context(Presence(config.room.case_dir, "listener"))
+        presence = stack.enter_context(Presence(case_dir, "listener"))
         retention_s = config.listener.retention_days * 86400
         tending = Tending(record, inbox, intake, retention_s)
         _loop(intake, scp, tending, received, stop, presence)

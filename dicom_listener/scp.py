@@ -26,6 +26,7 @@ from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.negotiation import NegotiationReport, add_contexts, rejection_text, report_of
 from dicom_listener.transport import BoundedSocket, PromptServer
 from dicom_slice.peek import NoDataSetError, peek
+from room_config.networks import address_of
 
 SUCCESS = 0x0000
 OUT_OF_RESOURCES = 0xA700
@@ -167,7 +168,7 @@ class Scp:
             return (1, 1, 7), f"called AE title {called!r} is not ours ({self._rules.ae_title})"
         if self._rules.calling_ae_titles and calling not in self._rules.calling_ae_titles:
             return (1, 1, 3), f"calling AE title {calling!r} is not on the list"
-        address = ipaddress.ip_address(association.requestor.address)
+        address = address_of(association.requestor.address)
         if self._networks and not any(address in network for network in self._networks):
             return (1, 1, 1), f"address {address} is not on the list"
         return None

@@ -1,7 +1,7 @@
 """Slices to and from what the case record keeps of them."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, fields
+from dataclasses import MISSING, asdict, fields
 from typing import Any
 
 from case_record.rows import NewSlice
@@ -21,15 +21,17 @@ def header_for_record(slice_: Slice) -> dict[str, Any]:
 
 def slice_from_record(header: Mapping[str, Any]) -> Slice:
     """The `Slice` whose header the record keeps. Raises KeyError where it keeps none."""
-    names = [field.name for field in fields(Slice)]
-    values = {name: header[name] for name in names}
+    # a record of before does not have what was added since
+    wanted = [one.name for one in fields(Slice) if one.name in header or one.default is MISSING]
+    values = {name: header[name] for name in wanted}
     geometry, interval = values["geometry"], values["interval"]
     values["geometry"] = None if geometry is None else _geometry(geometry)
     values["interval"] = None if interval is None else AcquisitionInterval(**interval)
     values["rescale"] = Rescale(**values["rescale"])
     values["kind"] = Kind(values["kind"])
     for name in ("shape", "image_type", "warnings"):
-        values[name] = tuple(values[name])
+        if name in values:
+            values[name] = tuple(values[name])
     return Slice(**values)
 
 

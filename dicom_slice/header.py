@@ -16,6 +16,7 @@ from pydicom.errors import InvalidDicomError
 from dicom_slice import quirks
 from dicom_slice.elements import Elements, FrameElements, frame_elements
 from dicom_slice.geometry import SliceGeometry
+from dicom_slice.patient import patient_digest
 from dicom_slice.quirks import Kind
 from dicom_slice.reasons import Reason, UnusableError
 from dicom_slice.times import (
@@ -81,6 +82,7 @@ class Slice:
     clock_synchronized: bool | None
     transfer_syntax_uid: str
     warnings: tuple[str, ...] = field(default=())
+    patient_digest: str = ""  # tells patients apart, names nobody; empty: not known
 
     @property
     def acquisition_key(self) -> tuple[int, int]:
@@ -232,6 +234,7 @@ def _slice(
         clock_synchronized={"Y": True, "N": False}.get(top.text("AcquisitionTimeSynchronized")),
         transfer_syntax_uid=_transfer_syntax(top.data_set),
         warnings=tuple(dict.fromkeys(top.warnings)),
+        patient_digest=patient_digest(top),
     )
 
 

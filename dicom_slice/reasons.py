@@ -46,6 +46,9 @@ class Reason(StrEnum):
     NOT_CONFIRMED = "not_confirmed"
     # The identity
     UID_CONFLICT = "same_uid_other_bytes"
+    OTHER_PATIENT = "other_patient"
+    OTHER_STUDY = "other_study"
+    OTHER_FRAME = "other_frame_of_reference"
 
 
 @dataclass(frozen=True)

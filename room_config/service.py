@@ -1,14 +1,34 @@
 """`[service]`: the page, the API, the procedure."""
 
+import ipaddress
 from datetime import UTC, date, datetime
 from pathlib import Path
 from typing import Literal
+from urllib.parse import SplitResult, urlsplit
 
-from pydantic import Field, model_validator
+from pydantic import Field, field_validator, model_validator
 
 from room_config.section import Section
 
 Strategy = Literal["base", "bicubic", "sr", "hybrid", "adaptive"]
+
+
+_LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
+
+
+def is_loopback(address: SplitResult) -> bool:
+    return address.hostname in _LOOPBACK
+
+
+def checked_public_url(text: str) -> str:
+    """Return the address with a slash at the end of its path; ValueError if it is none."""
+    parts = urlsplit(text)
+    _ = parts.port  # ValueError of its own if it is no number
+    if parts.scheme not in ("http", "https") or not parts.hostname:
+        raise ValueError(f"{text!r} is no address like https://navigator.example.org/")
+    if parts.query or parts.fragment or parts.username:
+        raise ValueError(f"{text!r} must be scheme, host, port and path only")
+    return f"{parts.scheme}://{parts.netloc}{parts.path.rstrip('/')}/"
 
 
 class AccessToken(Section):
@@ -120,6 +140,15 @@ class ServiceConfig(Section):
         default=None, description="PEM file; with tls_key the page is served over HTTPS."
     )
     tls_key: Path | None = Field(default=None, description="PEM file of the private key.")
+    public_url: str = Field(
+        default="",
+        description="What people type to come to the page where a reverse proxy stands in between, "
+        "as https://navigator.example.org/room1/; empty: they come to host and port themselves.",
+    )
+    trusted_proxies: list[str] = Field(
+        default=["127.0.0.1", "::1"],
+        description="Addresses and networks of the proxies whose X-Forwarded-For says who asks.",
+    )
     heartbeat_s: float = Field(default=0.2, gt=0, le=1)
     axes: list[str] = Field(
         default=["xt", "yt"],
@@ -173,10 +202,27 @@ class ServiceConfig(Section):
         "fiducial.",
     )
 
+    @field_validator("public_url")
+    @classmethod
+    def _is_web_address(cls, value: str) -> str:
+        return value and checked_public_url(value)
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _are_networks(cls, value: list[str]) -> list[str]:
+        for text in value:
+            ipaddress.ip_network(text, strict=False)
+        return value
+
     @model_validator(mode="after")
     def _access_is_whole(self) -> "ServiceConfig":
         if (self.tls_certificate is None) != (self.tls_key is None):
             raise ValueError("tls_certificate and tls_key go together")
+        if self.public_url and not self.token and not is_loopback(urlsplit(self.public_url)):
+            raise ValueError(
+                "public_url: others can reach the page by it: add [[service.token]] tables "
+                "(`autospine token NAME` makes one)"
+            )
         names = [token.name for token in self.token]
         if len(set(names)) != len(names):
             raise ValueError("two tokens have the same name")

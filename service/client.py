@@ -8,9 +8,11 @@ its answer was lost is not carried out twice.
 from __future__ import annotations
 
 import json
+import ssl
 import uuid
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, TypeVar
 
@@ -31,6 +33,7 @@ _TIMEOUT_S = 35.0
 _STOP_TIMEOUT_S = 2.0
 _LONG_TIMEOUT_S = 600.0
 _SILENT_S = 5.0
+_UNAVAILABLE = 503
 Model = TypeVar("Model", bound=BaseModel)
 
 
@@ -57,13 +60,21 @@ class LiveMessage:
 
 
 class RoomClient:
-    """Talks to one service; use it as a context manager."""
+    """Talks to one service; use it as a context manager.
 
-    def __init__(self, url: str, *, token: str = "", by: str = "operator") -> None:
+    url: as people type it, with the path prefix if a proxy has one. ca: PEM file of the authority
+    that signed the service's certificate, where the system does not know it.
+    """
+
+    def __init__(
+        self, url: str, *, token: str = "", by: str = "operator", ca: str | Path | None = None
+    ) -> None:
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         self.url = url
         self._by = by
-        self._http = httpx.Client(base_url=url, headers=headers, timeout=_TIMEOUT_S)
+        self._http = httpx.Client(
+            base_url=url, headers=headers, timeout=_TIMEOUT_S, verify=_verification(ca)
+        )
 
     def close(self) -> None:
         self._http.close()
@@ -82,8 +93,13 @@ class RoomClient:
     # Looking
 
     def state(self) -> RoomState:
-        """What the room is doing now."""
-        return self._get("/api/v1/state", RoomState)
+        """What the room is doing now; ServiceGoneError while the service does not know it."""
+        try:
+            return self._get("/api/v1/state", RoomState)
+        except RefusedByServiceError as error:
+            if error.status == _UNAVAILABLE:
+                raise ServiceGoneError(f"{self.url}: {error}") from error
+            raise
 
     def session(self) -> SessionBody:
         """Who this client is to the service."""
@@ -207,6 +223,15 @@ class RoomClient:
     def choose_target(self, number: int) -> None:
         self._order("POST", f"/api/v1/targets/{number}/choose")
 
+    def take_proposal(self, number: int, *, in_water: bool, label: str = "") -> None:
+        """Make what a planning station proposes the target; in_water: a place in tissue."""
+        path = f"/api/v1/proposals/{number}/take"
+        self._order("POST", path, in_water=in_water, label=label)
+
+    def refuse_proposal(self, number: int, why: str = "") -> None:
+        """Say no to what a planning station proposes; it is told why."""
+        self._order("POST", f"/api/v1/proposals/{number}/refuse", why=why)
+
     def set_entry(self, patient_mm: Sequence[float]) -> None:
         self._order("PUT", "/api/v1/entry", patient_mm=list(patient_mm))
 
@@ -289,6 +314,16 @@ class RoomClient:
 
     def _gone(self, error: httpx.TransportError) -> ServiceGoneError:
         return ServiceGoneError(f"{self.url}: {str(error) or type(error).__name__}")
+
+
+def _verification(ca: str | Path | None) -> ssl.SSLContext | bool:
+    """How to check the service's certificate; OSError that names the file if it cannot be read."""
+    if ca is None:
+        return True
+    try:
+        return ssl.create_default_context(cafile=str(ca))
+    except OSError as error:  # ssl.SSLError is one
+        raise OSError(f"{ca}: no certificate authority can be read from it ({error})") from error
 
 
 def _of_case(case: str | None) -> dict[str, Any]:

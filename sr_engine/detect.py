@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from sr_engine.checks import checked_frames, checked_radii
 from sr_engine.errors import ParameterError, ShapeError
 from sr_engine.match import Match, best_matches, correlate, radius_grid
-from sr_engine.resolution import LEAST_RADIUS_PX, grey_step, radius_seen_px
+from sr_engine.reconstruction.resolution import LEAST_RADIUS_PX, grey_step, radius_seen_px
 from sr_engine.roundness import REACH_PX, out_of_round_px, refine_circle, roundness
 
 Array = NDArray[np.float64]

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dposv
 
-from sr_engine.errors import NotConvergedError
+from sr_engine.errors import NoRoundObjectError, NotConvergedError
 from sr_engine.model import DISC, Shape, unit_object
 from sr_engine.noise import Moments, NoiseKind, colour_factor, is_white, moments, sigma_of
 from sr_engine.psf import Psf
@@ -45,6 +45,7 @@ _SAME_SIGMA = 0.1  # relative change of the noise level that leaves the weights 
 _SAME_PRIOR = 0.5  # likewise of a prior's precision
 _SETTLED = 1e-4  # expected change of chi2, so a step of 0.01 sigma in any parameter
 _NEARLY_SETTLED = 1e-2  # good enough after all iterations: a step of 0.1 sigma
+_LEAST_AMPLITUDE = 1e-3  # in sigma: below it nothing is left that has a centre or a radius
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +169,8 @@ def fit_disc(
       than outlier_sigma.
     whiten: allow for the colour that a k-space filter gives the noise; not where the model's own
       imperfection, and not noise, is what remains.
-    Raises NotConvergedError when the fit does not settle or leaves radius_bounds_px.
+    Raises NotConvergedError when the fit does not settle or leaves radius_bounds_px, and
+    NoRoundObjectError when it slides to an object without contrast.
     """
     begin = start.parameters[:2] if isinstance(start, DiscFit) else np.array(start[:2])
     reference = (float(np.round(begin[0])), float(np.round(begin[1])))
@@ -327,6 +329,7 @@ def _levenberg_marquardt(
         there = _evaluate(problem, moved, metric)
         trial = there.residual @ there.residual + precision @ (moved - mean) ** 2
         if trial <= cost * (1 + 1e-12):
+            _refuse_vanished(moved, metric.expected.sigma)
             parameters, at = moved, there
             damping = max(damping / 30, 1e-9)
         elif damping > 1e8:
@@ -336,6 +339,16 @@ def _levenberg_marquardt(
     if gain < _NEARLY_SETTLED * max(1.0, cost / at.residual.size):
         return parameters, at
     raise NotConvergedError(f"the fit did not settle in {_MAX_ITERATIONS} iterations")
+
+
+def _refuse_vanished(parameters: Array, sigma: float) -> None:
+    """An object without amplitude: its centre and radius are no longer in the signal."""
+    levels = np.abs(parameters[[AMPLITUDE, WALL] if parameters.size > WALL else [AMPLITUDE]])
+    if not levels.max() > _LEAST_AMPLITUDE * sigma:
+        row, col = parameters[:2]
+        raise NoRoundObjectError(
+            f"no round object at row {row:.1f}, col {col:.1f}: the best fit has no contrast"
+        )
 
 
 def _damped_step(

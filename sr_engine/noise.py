@@ -119,7 +119,9 @@ def colour_factor(
     """
     shape = (mask.shape[0], mask.shape[1])
     rho = _pixel_correlation(period, psf, shape, np.packbits(mask).tobytes())
-    linear = np.minimum(np.abs(expected.slope) * sigma / np.sqrt(expected.variance), 1.0)
+    # the sign counts: where the signal is negative (the undershoot beside an edge, ringing) the
+    # magnitude goes down as the channel goes up, against its neighbours on the positive side
+    linear = np.clip(expected.slope * sigma / np.sqrt(expected.variance), -1.0, 1.0)
     rest = np.sqrt(1 - linear**2)
     matrix = (1 - _WHITE_FLOOR) * (np.outer(linear, linear) * rho + np.outer(rest, rest) * rho**2)
     matrix[np.diag_indices_from(matrix)] += _WHITE_FLOOR

@@ -16,7 +16,6 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sr_engine.blur import Blur
 from sr_engine.checks import checked_radii, refuse_saturated
 from sr_engine.errors import (
     AmbiguousObjectError,
@@ -28,11 +27,12 @@ from sr_engine.errors import (
 )
 from sr_engine.frames import Region, check_factor, check_frames_and_shifts
 from sr_engine.hough import Circle, HoughSettings, hough_circles
-from sr_engine.ibp import Stopping, estimate_noise_sigma
-from sr_engine.interpolate import enlarge_bicubic, frame_from_fine
 from sr_engine.localization import Localization
 from sr_engine.psf import Psf
-from sr_engine.reconstruct import Reconstruction, reconstruct
+from sr_engine.reconstruction.blur import Blur
+from sr_engine.reconstruction.ibp import Stopping, estimate_noise_sigma
+from sr_engine.reconstruction.interpolate import enlarge_bicubic, frame_from_fine
+from sr_engine.reconstruction.reconstruct import Reconstruction, reconstruct
 
 Array = NDArray[np.float64]
 PaperMethod = Literal["base", "bicubic", "sr"]
@@ -60,7 +60,7 @@ class PaperSettings:
     """What the paper leaves open. ``hough`` has its radii in frame pixels.
 
     ``stopping`` None: the paper's rule or, earlier, the discrepancy principle;
-    ``sr_engine.ibp.PAPER`` is the paper's rule to the letter.
+    ``sr_engine.reconstruction.ibp.PAPER`` is the paper's rule to the letter.
     """
 
     hough: HoughSettings = field(default_factory=lambda: HoughSettings(DEFAULT_RADII_PX))

@@ -6,7 +6,9 @@ is recorded as failed, with the reason.
 
 from __future__ import annotations
 
+import contextlib
 import math
+import sqlite3
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
@@ -17,8 +19,11 @@ import numpy as np
 import structlog
 from numpy.typing import NDArray
 
+from case_record.attempts import MOST_DEATHS, Attempts
+from case_record.cases import Cases
+from case_record.connection import json_text
 from case_record.presence import Presence
-from case_record.record import CaseRecord
+from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Measurement, SliceRow
 from dicom_slice.geometry import SliceGeometry
 from dicom_slice.pixels import magnitude_pixels
@@ -38,10 +43,11 @@ from sr_engine.localize import SEARCH_PX, localize
 from sr_engine.paper import PaperMethod, PaperSettings, localize_paper
 from sr_engine.psf import Psf
 from sr_engine.recognise import psf_of_noise
-from sr_engine.reconstruct import reconstruct
+from sr_engine.reconstruction.reconstruct import reconstruct
 
 IMAGES = "images"
 ALIVE = "worker.alive"
+_RECORD_RETRY_S = 0.5
 _SAME_PLACE = 1e-6
 _SAME_SLICE_MM = 0.5
 log = structlog.get_logger()
@@ -90,26 +96,71 @@ class PointSpreads:
 
 
 def serve(config: Config, should_stop: Callable[[], bool]) -> None:
-    """Work until `should_stop`; looks for requests every `poll_s`, says every second: alive."""
-    case_dir = config.room.case_dir
-    alive = case_dir / ALIVE
-    said_s = 0.0
+    """Work until `should_stop` on whatever case is open; says every second: alive.
+
+    While the record cannot be read or written it is tried again: the requests stand in it.
+    """
+    cases = Cases(*config.room.folders)
     psfs = PointSpreads(config.imaging.point_spread)
-    with CaseRecord(case_dir, create=True) as record, Presence(case_dir, "worker") as presence:
-        while not should_stop():
+    with Presence(cases.home, "worker") as presence:
+        told_s = 0.0
+
+        def alive() -> bool:
+            nonlocal told_s
             presence.beat()
-            if time.monotonic() - said_s > 1.0:
-                alive.touch()
-                said_s = time.monotonic()
-            for request in record.requested_measurements():
-                measure(record, request, config.worker.reconstruction_factor, psfs)
+            if time.monotonic() - told_s > 1.0:
+                told_s = time.monotonic()
+                with contextlib.suppress(OSError):  # a disk that takes nothing
+                    (cases.home / ALIVE).touch()
             time.sleep(config.worker.poll_s)
+            return not should_stop()
+
+        while alive():
+            try:
+                case_dir = cases.open
+                if case_dir is not None:
+                    _work_on(case_dir, cases, config, psfs, alive)
+            except (CaseRecordError, sqlite3.Error, OSError) as error:
+                log.error("the case record cannot be used", error=str(error))
+                time.sleep(_RECORD_RETRY_S)
+
+
+def _work_on(
+    case_dir: Path, cases: Cases, config: Config, psfs: PointSpreads, alive: Callable[[], bool]
+) -> None:
+    """Answer the requests of one case for as long as it is the open one."""
+    factor = config.worker.reconstruction_factor
+    with CaseRecord(case_dir, create=True) as record, Attempts(case_dir, "worker") as attempts:
+        while alive() and cases.open == case_dir:
+            for request in record.requested_measurements():
+                attempt(record, request, factor, psfs, attempts)
+
+
+def attempt(
+    record: CaseRecord,
+    request: Measurement,
+    factor: int,
+    psfs: PointSpreads,
+    attempts: Attempts,
+) -> None:
+    """As `measure`, unless this request has ended the worker again and again."""
+    key = f"measurement {request.measurement_id}"
+    if attempts.deaths(key) >= MOST_DEATHS:
+        text = f"the worker ended {attempts.deaths(key)} times while it was at this measurement"
+        _fail(record, request.measurement_id, "worker_ended", text)
+        attempts.forget(key)
+        return
+    with attempts.at(key):
+        measure(record, request, factor, psfs)
 
 
 def measure(
     record: CaseRecord, request: Measurement, factor: int, psfs: PointSpreads | None = None
 ) -> None:
-    """Carry out one requested measurement and record its result, or why there is none."""
+    """Carry out one requested measurement and record its result, or why there is none.
+
+    Raises only what the record itself raises: any other fault ends this measurement alone.
+    """
     number = request.measurement_id
     try:
         frames = gather_frames(record, request)
@@ -118,15 +169,16 @@ def measure(
         result = describe_result(frames, found)
         result["point_spread"] = asdict(psf)
         result["reconstruction"] = _reconstruction(record.case_dir, number, frames, factor)
+        json_text(result)  # NaN, or a value of no known type, is found here and not in the record
     except (EngineError, UnusableSlicesError, UnusableError) as error:
-        with record.transaction():
-            record.fail_measurement(number, _code_of(error), str(error))
-            record.append_event(
-                "measurement_failed",
-                {"measurement_id": number, "reason": str(error)},
-                source="worker",
-            )
-        log.warning("measurement failed", measurement_id=number, reason=str(error))
+        _fail(record, number, _code_of(error), str(error))
+        return
+    except sqlite3.Error:
+        raise
+    except Exception as error:
+        log.exception("measurement failed", measurement_id=number)
+        text = f"the measurement could not be made ({type(error).__name__}: {error})"
+        _fail(record, number, "internal_error", text)
         return
     with record.transaction():
         record.finish_measurement(number, result)
@@ -135,6 +187,14 @@ def measure(
             {"measurement_id": number, "patient_mm": result["patient_mm"]},
             source="worker",
         )
+
+
+def _fail(record: CaseRecord, number: int, code: str, text: str) -> None:
+    with record.transaction():
+        record.fail_measurement(number, code, text)
+        body = {"measurement_id": number, "reason": text}
+        record.append_event("measurement_failed", body, source="worker")
+    log.warning("measurement failed", measurement_id=number, reason=text)
 
 
 def gather_frames(record: CaseRecord, request: Measurement) -> Frames:
@@ -219,8 +279,9 @@ def describe_result(frames: Frames, found: Localization) -> dict[str, Any]:
 
 def _scan_s(header: Mapping[str, Any]) -> float:
     """How long the scanner took for this slice, by its own clock; 0 where it does not say."""
-    interval = header.get("interval")
-    return float(interval["end_s"] - interval["start_s"]) if interval else 0.0
+    interval = header.get("interval") or {}
+    start_s, end_s = interval.get("start_s"), interval.get("end_s")
+    return 0.0 if start_s is None or end_s is None else float(end_s - start_s)
 
 
 def _code_of(error: EngineError | UnusableSlicesError | UnusableError) -> str:

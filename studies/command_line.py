@@ -12,9 +12,10 @@ from typing import Annotated, Literal
 
 import typer
 
+from room_config.exit_codes import BAD_INPUT
+
 app = typer.Typer(no_args_is_help=True, help="Repeat the paper's experiments, ours beside them.")
 
-BAD_INPUT = 2
 PIPE_WIDTH = 120
 
 
@@ -197,7 +198,7 @@ def _check(trials: int, map_trials: int, seed: int, radius: float, snr: float, b
 
 def _check_point(point: object) -> None:
     """What only the engine knows: the sensitivity's range, the names of the shift sets."""
-    from sr_engine.shiftset import named
+    from sr_engine.reconstruction.shiftset import named
     from studies.numerical import StudyPoint
 
     assert isinstance(point, StudyPoint)

@@ -15,15 +15,15 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from sr_engine import shiftset
-from sr_engine.blur import Blur
 from sr_engine.errors import EngineError
 from sr_engine.hough import HoughSettings
-from sr_engine.ibp import PAPER
 from sr_engine.localization import Localization
 from sr_engine.localize import localize
 from sr_engine.paper import PaperMethod, PaperSettings, localize_paper
 from sr_engine.psf import Psf
+from sr_engine.reconstruction import shiftset
+from sr_engine.reconstruction.blur import Blur
+from sr_engine.reconstruction.ibp import PAPER
 from sr_engine.simulate import filtered_noise, render_disc
 from studies.circle_scene import CircleScene
 

@@ -7,6 +7,7 @@ need() { command -v "$1" >/dev/null 2>&1 || wanted="$wanted $2"; }
 need storescu dcmtk
 need Orthanc orthanc
 need chromium chromium
+need nginx nginx-light
 need docker-compose docker-compose
 need dciodvfy dicom3tools
 [ -n "$wanted" ] || exit 0

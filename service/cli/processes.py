@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import signal
 import socket
 import sys
@@ -13,25 +14,36 @@ import structlog
 import typer
 import uvicorn
 
+from case_record.cases import Cases
+from case_record.presence import Sole
 from room_config.load import Config, ConfigError, load_config
+from room_config.networks import with_mapped
 from room_config.shell import announce, configure_logs, on_parent_gone
 
 ConfigOption = Annotated[Path, typer.Option("--config", help="The room's TOML file.")]
 ParentOption = Annotated[
     bool, typer.Option("--exit-with-parent", help="End when standard input is closed.")
 ]
+FAILED = 3
+_LET_GO_S = 3.0
 _SWITCH_INTERVAL_S = 0.0002
 _LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> None:
     """Page, API, procedure, planner."""
+    configure_logs()
+    room = load_config(config)
+    cases = Cases(*room.room.folders)
+    with Sole(cases.home, "service"):
+        _serve(room, cases, exit_with_parent)
+
+
+def _serve(room: Config, cases: Cases, exit_with_parent: bool) -> None:
     from service.room.control import ControlLoop
     from service.slicer.server import OpenIgtLinkServer, bind_openigtlink
     from service.web.app import create_app
 
-    configure_logs()
-    room = load_config(config)
     check_device(room.service.bridge_link)
     listening = bind(room)
     host, port = listening.getsockname()[:2]
@@ -44,10 +56,21 @@ def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> Non
 
     def scene(loop: ControlLoop) -> OpenIgtLinkServer:
         assert followers is not None
-        return OpenIgtLinkServer(room.openigtlink, room.room.case_dir, loop, followers)
+        return OpenIgtLinkServer(room, cases, loop, followers)
+
+    failed = threading.Event()
+
+    def end_failed() -> None:
+        # ended, so that it is started again; by force if others do not let go of it in time
+        failed.set()
+        server.should_exit = True
+        threading.Timer(_LET_GO_S, os._exit, (FAILED,)).start()
 
     app = create_app(
-        room, announce=lambda: announce(ready), scene=None if followers is None else scene
+        room,
+        announce=lambda: announce(ready),
+        scene=None if followers is None else scene,
+        on_failure=end_failed,
     )
     # the control loop must not wait long for the interpreter while a page is being served
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
@@ -58,6 +81,8 @@ def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> Non
             access_log=False,
             server_header=False,
             timeout_graceful_shutdown=1,
+            proxy_headers=True,
+            forwarded_allow_ips=with_mapped(room.service.trusted_proxies),
             ssl_certfile=room.service.tls_certificate,
             ssl_keyfile=room.service.tls_key,
         )
@@ -66,6 +91,8 @@ def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> Non
     if exit_with_parent:
         on_parent_gone(lambda: setattr(server, "should_exit", True))
     server.run(sockets=[listening])
+    if failed.is_set():
+        os._exit(FAILED)
 
 
 def _check_tls(server: uvicorn.Server) -> None:

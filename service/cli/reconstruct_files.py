@@ -14,7 +14,7 @@ from service.cli.files import BadFileError, files_of, geometry_of, read_shift_ta
 from service.dicom_out.derived import derived_image
 from service.room.images import png_of
 from sr_engine.errors import EngineError
-from sr_engine.reconstruct import reconstruct
+from sr_engine.reconstruction.reconstruct import reconstruct
 
 METHODS = ("fourier", "ibp")
 app = typer.Typer(add_completion=False)

@@ -18,7 +18,7 @@ from pydicom.uid import ExplicitVRLittleEndian, MRImageStorage, generate_uid
 from pydicom.valuerep import format_number_as_ds
 
 from dicom_slice.geometry import SliceGeometry
-from sr_engine.reconstruct import Reconstruction
+from sr_engine.reconstruction.reconstruct import Reconstruction
 
 # what the derived image shares with its sources
 _KEPT = (

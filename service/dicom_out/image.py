@@ -12,8 +12,8 @@ from service.dicom_out.finding import Finding
 from service.dicom_out.identity import output_uid, series_uid, stamp
 from service.dicom_out.source import tidy_patient
 from sr_engine.frames import whole
-from sr_engine.reconstruct import Reconstruction
-from sr_engine.shiftset import condition_number, noise_factor
+from sr_engine.reconstruction.reconstruct import Reconstruction
+from sr_engine.reconstruction.shiftset import condition_number, noise_factor
 
 
 def has_image(finding: Finding) -> bool:

@@ -16,6 +16,7 @@ import time
 
 import structlog
 
+from case_record.cases import Cases
 from case_record.connection import FILE_NAME
 from case_record.presence import Presence, Sole
 from case_record.record import CaseRecord, CaseRecordError
@@ -94,7 +95,7 @@ def sop_instance_uid(path: os.PathLike[str]) -> str:
 
 def serve(config: Config, stop: threading.Event) -> None:
     """Make and send until `stop`."""
-    case_dir = config.room.case_dir
+    case_dir = Cases(*config.room.folders).required()
     kinds = {one.name: one.kinds for one in config.outputs.destination}
     while not (case_dir / FILE_NAME).is_file():  # the service is about to begin the case
         if stop.wait(_LOOK_S):

@@ -14,6 +14,7 @@ import structlog
 from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
+from case_record.cases import Cases
 from room_config.load import Config
 from service.dicom_out.outbox_store import STATES, Line, OutboxStore
 from service.room.alarms import Condition
@@ -31,6 +32,7 @@ class OutboxWatch(Collector):
 
     def __init__(self, config: Config) -> None:
         self._config = config
+        self._cases = Cases(*config.room.folders)
         self._names = [one.name for one in config.outputs.destination]
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
@@ -82,9 +84,10 @@ class OutboxWatch(Collector):
             child.end()
 
     def _look(self) -> None:
-        if not self._config.room.case_dir.is_dir():
+        case_dir = self._cases.open
+        if case_dir is None or not case_dir.is_dir():
             return
-        with OutboxStore(self._config.room.case_dir) as store:
+        with OutboxStore(case_dir) as store:
             self._lines, self._counts = store.lines(), store.counts()
 
     def _what_is_wrong(self, problem: str) -> Iterable[Condition]:

@@ -66,5 +66,5 @@ export async function order(method, path, body = {}) {
 }
 
 export async function stopRobot(emergency = false) {
-  await request("POST", "/api/v1/stop", { emergency });
+  await request("POST", "api/v1/stop", { emergency });
 }

@@ -2,7 +2,7 @@
 // interesting errors go from 20 mm down to 0.02 mm.
 
 import { byId, h, replace, s, whenChanged } from "./dom.js";
-import { mm } from "./words.js";
+import { mm } from "./format.js";
 
 const [WIDE, HIGH, LEFT, BOTTOM, TOP] = [460, 170, 42, 18, 8];
 const MOST = 40;

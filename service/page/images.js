@@ -3,9 +3,9 @@
 import { getPixels, order } from "./api.js";
 import { h, replace, s, setText, whenChanged } from "./dom.js";
 import { ellipse, patientFromPixel, pixelFromPatient } from "./geometry.js";
-import { act, arrow } from "./next.js";
+import { act, arrow } from "./actions.js";
 import { natural, SliceView } from "./slice_view.js";
-import { age, clock } from "./words.js";
+import { age, clock } from "./format.js";
 
 const LAYOUTS = [["slice", "Slice"], ["both", "Both"], ["reconstruction", "Reconstruction"], ["blend", "Blended"]];
 const NUDGE_MM = 0.1;
@@ -81,7 +81,7 @@ export class Images {
   async fetchSlice({ id }) {
     const geometry = this.state.slice;
     try {
-      const pixels = await getPixels(`/api/v1/slices/${id}/pixels`);
+      const pixels = await getPixels(`api/v1/slices/${id}/pixels`);
       if (this.state.slice.slice_id !== id) return;
       this.slice.show(geometry, pixels, `Slice ${id}`);
       this.shownSliceId = id;
@@ -96,7 +96,7 @@ export class Images {
   async fetchSr({ id }) {
     const geometry = this.state.reconstruction;
     try {
-      this.sr.show(geometry, await getPixels(`/api/v1/measurements/${id}/pixels`), `×${geometry.factor}, measurement ${id}`);
+      this.sr.show(geometry, await getPixels(`api/v1/measurements/${id}/pixels`), `×${geometry.factor}, measurement ${id}`);
     } catch (error) {
       this.sr.clear(error.message);
     }
@@ -268,7 +268,7 @@ export class Images {
     }));
     this.inTissue ??= h("input", { type: "checkbox", id: "in-tissue" });
     const withdraw = this.state.target_patient_mm ? h("button", {
-      type: "button", onclick: () => act(async () => { await order("POST", "/api/v1/target/withdraw"); this.endPick(); }),
+      type: "button", onclick: () => act(async () => { await order("POST", "api/v1/target/withdraw"); this.endPick(); }),
     }, "Withdraw the target") : null;
     replace(this.pickBar, h("span", {}, "Target, patient mm (LPS); arrow keys move it by 0.1 mm: "),
       number(0, "x"), number(1, "y"), number(2, "z"),
@@ -282,7 +282,7 @@ export class Images {
 
   async setTarget(what) {
     const more = what === "target" ? { in_water: this.inTissue.checked } : {};
-    await order("PUT", `/api/v1/${what}`, { patient_mm: this.picked, ...more });
+    await order("PUT", `api/v1/${what}`, { patient_mm: this.picked, ...more });
     this.endPick();
   }
 

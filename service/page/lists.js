@@ -2,8 +2,8 @@
 
 import { get, order } from "./api.js";
 import { byId, h, replace, whenChanged } from "./dom.js";
-import { act } from "./next.js";
-import { clock, day, mm, plain } from "./words.js";
+import { act } from "./actions.js";
+import { clock, day, mm, plain } from "./format.js";
 
 const MOST_EVENTS = 200;
 
@@ -48,7 +48,7 @@ const giveUp = whenChanged((offered) => {
     class: "give-up",
     onsubmit: (event) => {
       event.preventDefault();
-      act(() => order("POST", `/api/v1/holds/${input.valueAsNumber}/give-up`, { why: "said on the page" }));
+      act(() => order("POST", `api/v1/holds/${input.valueAsNumber}/give-up`, { why: "said on the page" }));
     },
   }, h("label", { htmlFor: "lacking-hold" }, "No more slices will come of hold "), input, " ", h("button", {}, "Give them up"));
   replace(byId("give-up"), offered ? form : null);
@@ -58,15 +58,15 @@ const giveUp = whenChanged((offered) => {
 export async function drawAside(state, role) {
   const count = state.slices.quarantined ?? 0;
   byId("aside-count").textContent = count ? String(count) : "";
-  const rows = await get("/api/v1/slices?state=quarantined&newest=true&limit=30");
+  const rows = await get("api/v1/slices?state=quarantined&newest=true&limit=30");
   const hold = state.hold;
   const table = h("table", {}, h("thead", {}, h("tr", {}, ["Slice", "Received", "Why", ""].map((name) => h("th", { scope: "col" }, name)))),
     h("tbody", {}, rows.map((row) => h("tr", {},
-      h("td", { class: "left" }, h("a", { href: `/api/v1/slices/${row.slice_id}/image.png?scale=4`, target: "_blank", rel: "noopener" }, String(row.slice_id))),
+      h("td", { class: "left" }, h("a", { href: `api/v1/slices/${row.slice_id}/image.png?scale=4`, target: "_blank", rel: "noopener" }, String(row.slice_id))),
       h("td", { class: "left" }, clock(row.received_s)),
       h("td", { class: "left" }, row.reason || plain(row.reason_code)),
       h("td", {}, role === "operator" && hold && row.geometry ? h("button", {
-        type: "button", onclick: () => act(() => order("POST", `/api/v1/slices/${row.slice_id}/assignment`, { hold_id: hold.hold_id })),
+        type: "button", onclick: () => act(() => order("POST", `api/v1/slices/${row.slice_id}/assignment`, { hold_id: hold.hold_id })),
       }, `Use at hold ${hold.hold_id}`) : null)))));
   replace(byId("aside"), rows.length ? table : h("p", { class: "quiet" }, "None."));
   giveUp(role === "operator" && rows.length > 0);
@@ -78,21 +78,21 @@ export const drawCase = whenChanged(({ description, case_uid, role }) => {
     onsubmit: (event) => {
       event.preventDefault();
       const fields = Object.fromEntries(new FormData(form));
-      act(() => order("PUT", "/api/v1/case", fields));
+      act(() => order("PUT", "api/v1/case", fields));
     },
   },
   input("label", "Name of the case", description?.label), input("operator", "Operator", description?.operator),
   input("note", "Note", description?.note),
   h("button", { disabled: role !== "operator" }, "Save"));
   const papers = h("p", { class: "papers" },
-    h("a", { href: "/api/v1/report", target: "_blank", rel: "noopener" }, "Report of this case"),
-    h("a", { href: "/api/v1/export", download: "" }, "Export it as a zip"));
+    h("a", { href: "api/v1/report", target: "_blank", rel: "noopener" }, "Report of this case"),
+    h("a", { href: "api/v1/export", download: "" }, "Export it as a zip"));
   replace(byId("case"), form, papers, h("p", { class: "quiet" }, `Case ${case_uid || "not begun"}. No patient's name here: the record is exported as it is.`));
 });
 
 // Every target that was set in this case: one that was approached before can be taken again.
 export async function drawTargets(role) {
-  const targets = (await get("/api/v1/targets")).reverse().slice(0, 30);
+  const targets = (await get("api/v1/targets")).reverse().slice(0, 30);
   const table = h("table", {}, h("thead", {}, h("tr", {}, ["Target", "Patient mm", "Approached", ""].map((name) => h("th", { scope: "col" }, name)))),
     h("tbody", {}, targets.map((one) => h("tr", {},
       h("td", { class: "left" }, one.label || clock(one.set_s), one.in_water ? " (in tissue)" : ""),
@@ -100,7 +100,7 @@ export async function drawTargets(role) {
       h("td", {}, String(one.approaches.length)),
       h("td", {}, one.current ? h("b", {}, "now") : h("button", {
         type: "button", disabled: role !== "operator", "aria-label": `Take target ${one.label || clock(one.set_s)} again`,
-        onclick: () => act(() => order("POST", `/api/v1/targets/${one.number}/choose`)),
+        onclick: () => act(() => order("POST", `api/v1/targets/${one.number}/choose`)),
       }, "Take again"))))));
   replace(byId("targets"), targets.length ? table : h("p", { class: "quiet" }, "None yet."));
 }
@@ -108,13 +108,13 @@ export async function drawTargets(role) {
 function papersOf(folder) {
   const of = `?case=${encodeURIComponent(folder)}`;
   return [
-    h("a", { href: `/api/v1/report${of}`, target: "_blank", rel: "noopener", "aria-label": `Report of ${folder}` }, "report"),
-    h("a", { href: `/api/v1/export${of}`, download: "", "aria-label": `Export of ${folder}` }, "zip"),
+    h("a", { href: `api/v1/report${of}`, target: "_blank", rel: "noopener", "aria-label": `Report of ${folder}` }, "report"),
+    h("a", { href: `api/v1/export${of}`, download: "", "aria-label": `Export of ${folder}` }, "zip"),
   ];
 }
 
 export async function drawPast() {
-  const cases = await get("/api/v1/cases");
+  const cases = await get("api/v1/cases");
   const table = h("table", {}, h("thead", {}, h("tr", {}, ["Case", "Begun", "Slices", "Measured", "Punctured", "Papers"].map((name) => h("th", { scope: "col" }, name)))),
     h("tbody", {}, cases.map((one) => h("tr", {},
       h("td", { class: "left" }, one.current ? h("b", {}, one.label || one.folder) : one.label || one.folder),
@@ -129,12 +129,12 @@ export const drawJog = whenChanged(({ positions_um, possible }) => {
   const rows = Object.entries(positions_um).map(([axis, um]) => {
     const button = (by) => h("button", {
       type: "button", disabled: !possible, "aria-label": `${axis} ${by > 0 ? "plus" : "minus"} ${Math.abs(by)} mm`,
-      onclick: () => act(() => order("POST", "/api/v1/jog", { axis, distance_um: Math.round(1000 * by) })),
+      onclick: () => act(() => order("POST", "api/v1/jog", { axis, distance_um: Math.round(1000 * by) })),
     }, `${by > 0 ? "+" : "−"}${Math.abs(by)}`);
     return h("div", { class: "row" }, h("b", {}, axis), button(-STEPS_MM[0]), button(-STEPS_MM[1]),
       h("output", {}, `${mm(um / 1000, 3)} mm`), button(STEPS_MM[1]), button(STEPS_MM[0]));
   });
-  const lock = h("p", {}, h("button", { type: "button", disabled: !possible, onclick: () => act(() => order("POST", "/api/v1/lock")) }, "Lock motion for the needle"));
+  const lock = h("p", {}, h("button", { type: "button", disabled: !possible, onclick: () => act(() => order("POST", "api/v1/lock")) }, "Lock motion for the needle"));
   replace(byId("jog-body"), rows.length ? [...rows, lock] : "No link to the robot.",
     possible ? null : h("p", { class: "quiet" }, "Only while no procedure runs, the robot is armed and not locked."));
 });

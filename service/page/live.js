@@ -1,9 +1,9 @@
 // The event stream: the state whenever it changes, each new event of the record, and a beat every
-// second, so that silence is noticed even when the connection looks open.
+// third of a second, so that silence is noticed even when the connection looks open.
 
-const SILENT_MS = 2500;
+const SILENT_MS = 1000;
 // the service answers, but its control loop has not said anything for so long
-const OLD_S = 3;
+const OLD_S = 1;
 
 export class Live {
   constructor({ onState, onEvent, onUp, onDown, onClock }) {
@@ -18,7 +18,7 @@ export class Live {
   open(afterId) {
     this.lastId = Math.max(afterId, this.lastId);
     this.source?.close();
-    const source = new EventSource(`/api/v1/events/live?after=${this.lastId}`);
+    const source = new EventSource(`api/v1/events/live?after=${this.lastId}`);
     this.source = source;
     source.addEventListener("state", (message) => this.heard(() => this.on.onState(JSON.parse(message.data))));
     source.addEventListener("record", (message) => this.heard(() => {
@@ -26,9 +26,9 @@ export class Live {
       this.on.onEvent(JSON.parse(message.data));
     }));
     source.addEventListener("beat", (message) => {
-      const { at_s: atS, now_s: nowS } = JSON.parse(message.data);
+      const { age_s: ageS, now_s: nowS } = JSON.parse(message.data);
       this.on.onClock(nowS);
-      if (nowS - atS > OLD_S) this.lost(nowS - atS);
+      if (ageS > OLD_S) this.lost(ageS);
       else this.heard(() => {});
     });
     source.onerror = () => this.lost();
@@ -54,8 +54,8 @@ export class Live {
     const silentMs = performance.now() - this.heardMs;
     if (silentMs > SILENT_MS) this.lost(silentMs / 1000);
     // the browser gives up on some errors (a 401, a proxy's 502): ask again ourselves
-    if (this.source?.readyState === EventSource.CLOSED || silentMs > 4 * SILENT_MS) {
-      this.heardMs = Math.max(this.heardMs, performance.now() - 3 * SILENT_MS);
+    if (this.source?.readyState === EventSource.CLOSED || silentMs > 10 * SILENT_MS) {
+      this.heardMs = Math.max(this.heardMs, performance.now() - 8 * SILENT_MS);
       this.open(this.lastId);
     }
   }

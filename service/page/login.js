@@ -5,7 +5,7 @@ import { byId, h, replace } from "./dom.js";
 
 // {name, role, csrf}: who this browser is to the service
 export async function whoAmI() {
-  const session = await get("/api/v1/session");
+  const session = await get("api/v1/session");
   useCsrf(session.csrf);
   return session;
 }
@@ -18,7 +18,7 @@ export function askForToken(onDone) {
     onsubmit: async (event) => {
       event.preventDefault();
       try {
-        await order("POST", "/api/v1/session", { token: token.value });
+        await order("POST", "api/v1/session", { token: token.value });
         dialog.close();
         onDone();
       } catch (error) {
@@ -34,6 +34,6 @@ export function askForToken(onDone) {
 }
 
 export async function leave() {
-  await order("DELETE", "/api/v1/session");
+  await order("DELETE", "api/v1/session");
   location.reload();
 }

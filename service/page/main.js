@@ -2,16 +2,17 @@
 
 import { get, stopRobot } from "./api.js";
 import { byId, setHidden, setText, whenChanged } from "./dom.js";
-import { drawHead, drawLights, showLost, showUp, startClock } from "./head.js";
+import { drawHead, drawLights, showLost, showUp, startClock } from "./header.js";
 import { drawHistory } from "./history_plot.js";
 import { Images } from "./images.js";
 import { addEvent, drawAlarms, drawAside, drawCase, drawJog, drawPast, drawTargets } from "./lists.js";
 import { Live } from "./live.js";
 import { askForToken, leave, whoAmI } from "./login.js";
-import { act, Next } from "./next.js";
-import { drawParts, keepCounting } from "./parts.js";
+import { act, Next } from "./actions.js";
+import { drawProposals } from "./proposals.js";
+import { drawParts, keepCounting } from "./system_status.js";
 import { drawScannerClock, heardFromRoom } from "./scanner_clock.js";
-import { drawNumbers } from "./numbers.js";
+import { drawNumbers } from "./distance.js";
 import { drawStages } from "./stage_map.js";
 
 const page = { state: null, role: "viewer", measurements: [], connected: false };
@@ -28,6 +29,7 @@ function draw(state) {
   drawNumbers({ error: state.error, measurement: state.measurement, tolerance_mm: state.tolerance_mm, arrival: state.arrival, slice: state.slice, guide: state.guide });
   drawStages({ robot: { travel_um: robot.travel_um, positions_um: robot.positions_um, position_certain: robot.position_certain }, plan: question?.plan });
   drawAlarms(state.alarms ?? []);
+  drawProposals({ proposals: state.proposals ?? [], role: page.role });
   drawJog({ positions_um: robot.positions_um, possible: page.role === "operator" && state.jog_possible });
   drawCase({ description: state.case, case_uid: state.case_uid, role: page.role });
   drawScannerClock({ clock: state.clock, role: page.role });
@@ -45,7 +47,7 @@ const newPast = whenChanged(() => quietly(drawPast()));
 const newMeasurements = whenChanged(() => quietly(loadMeasurements()));
 
 async function loadMeasurements() {
-  const found = await get("/api/v1/measurements?newest=true&limit=60");
+  const found = await get("api/v1/measurements?newest=true&limit=60");
   page.measurements = found.reverse();
   drawHistory({ measurements: page.measurements, toleranceMm: page.state.tolerance_mm, guide: page.state.guide });
 }
@@ -86,7 +88,7 @@ async function begin() {
   page.role = me.role;
   setText(byId("who"), me.needs_token ? `${me.name} (${me.role})` : "");
   setHidden(byId("leave"), !me.needs_token);
-  const events = await get("/api/v1/events?newest=true&limit=120");
+  const events = await get("api/v1/events?newest=true&limit=120");
   byId("events").replaceChildren();
   events.reverse().forEach(addEvent);
   live.open(events.at(-1)?.event_id ?? 0);

@@ -3,8 +3,8 @@
 
 import { order } from "./api.js";
 import { byId, h, replace, setText, whenChanged } from "./dom.js";
-import { act } from "./next.js";
-import { day } from "./words.js";
+import { act } from "./actions.js";
+import { day } from "./format.js";
 
 const DAY_S = 86400;
 // a person presses within this of the second that is shown (1 sigma of eye and hand, and its rounding)
@@ -50,7 +50,7 @@ export const drawScannerClock = whenChanged(({ clock, role }) => {
   const input = h("input", { id: "scanner-shows", placeholder: "hh:mm:ss", inputMode: "numeric", autocomplete: "off", size: 9, disabled: role !== "operator" });
   const said = h("p", { class: "quiet", role: "status" });
   let offset = NaN;
-  const use = h("button", { type: "button", hidden: true, onclick: () => act(() => order("PUT", "/api/v1/clock", { offset_s: offset, uncertainty_s: UNCERTAINTY_S })) }, "Use this");
+  const use = h("button", { type: "button", hidden: true, onclick: () => act(() => order("PUT", "api/v1/clock", { offset_s: offset, uncertainty_s: UNCERTAINTY_S })) }, "Use this");
   const compare = h("button", {
     type: "button", disabled: role !== "operator",
     onclick: () => {
@@ -62,7 +62,7 @@ export const drawScannerClock = whenChanged(({ clock, role }) => {
   }, "It shows this now");
   const forget = h("button", {
     type: "button", disabled: role !== "operator", title: "The next slices show it anew; they must come promptly.",
-    onclick: () => act(() => order("POST", "/api/v1/clock/reset", { why: "said on the page" })),
+    onclick: () => act(() => order("POST", "api/v1/clock/reset", { why: "said on the page" })),
   }, "It was set anew: forget this");
   replace(byId("scanner-clock"), h("p", { class: "quiet" }, known),
     h("p", {}, h("label", { htmlFor: "scanner-shows" }, "The scanner shows "), input, " ", compare), said, use, clock ? h("p", {}, forget) : null);

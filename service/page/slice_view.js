@@ -3,7 +3,7 @@
 
 import { h, replace, s } from "./dom.js";
 import { letter, opposite, patientFromPixel } from "./geometry.js";
-import { mm } from "./words.js";
+import { mm } from "./format.js";
 
 const MOST_ZOOM = 64;
 

@@ -1,7 +1,7 @@
 // The stages in their travel: x to the right, y upwards, mm; one map a stage.
 
 import { byId, replace, s, whenChanged } from "./dom.js";
-import { mm } from "./words.js";
+import { mm } from "./format.js";
 
 const STAGES = [["top stage", "xt", "yt"], ["bottom stage", "xb", "yb"]];
 

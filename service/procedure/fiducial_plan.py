@@ -14,7 +14,7 @@ from service.procedure.plan import Travel, check_travel
 from service.procedure.recording import RecordingArguments
 from service.procedure.sensing import ValidationGate
 from service.procedure.targets import Target, fiducial_must_appear_at
-from sr_engine.shiftset import named, paper_random
+from sr_engine.reconstruction.shiftset import named, paper_random
 
 # a recorded target is to be known this much better than it must be reached
 TARGET_SHARE = 5

@@ -6,15 +6,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from service.procedure.calibration import Calibration, drive_and_learn
 from service.procedure.estimate import FiducialEstimate
 from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_looking import BothSeen, gates, see_both
-from service.procedure.jacobian import ImageJacobian
+from service.procedure.jacobian import SMALLEST_ANGLE_DEG, ImageJacobian
 from service.procedure.sensing import Expectation, ProcedureFailedError, ValidationGate
 from service.procedure.steps import ProcedureSteps
 
+Array = NDArray[np.float64]
 _FIRST_GATE = 1.4
 _SHARE_TOLERANCE = 0.35
 
@@ -102,3 +104,22 @@ def _check_shares(jacobian: ImageJacobian, geometry: GuideGeometry) -> None:
                     f"axis {axis}: the {name} fiducial moved {length:.2f} mm per mm of setpoint, "
                     f"expected {expected:.2f}; was the move seen?",
                 )
+    for pair in ((0, 1), (2, 3)):
+        _check_angle(jacobian, pair, shares if pair == (0, 1) else 1 - shares)
+
+
+def _check_angle(jacobian: ImageJacobian, pair: tuple[int, int], shares: Array) -> None:
+    """Refuse two axes of one stage that move the guide along (nearly) one line."""
+    matrix = jacobian.mean_columns
+    # seen by the fiducial that this stage moves most
+    rows = slice(0, 2) if abs(shares[0]) >= abs(shares[1]) else slice(2, 4)
+    one, other = (matrix[rows, number] for number in pair)
+    cosine = abs(float(one @ other)) / float(np.linalg.norm(one) * np.linalg.norm(other))
+    angle_deg = float(np.degrees(np.arccos(min(1.0, cosine))))
+    if not angle_deg >= SMALLEST_ANGLE_DEG:
+        first, second = (jacobian.axes[number] for number in pair)
+        raise ProcedureFailedError(
+            "calibration",
+            f"axes {first} and {second} move the guide along lines only {angle_deg:.0f}° apart, "
+            f"expected at least {SMALLEST_ANGLE_DEG:.0f}°: is a cable in another axis's place?",
+        )

@@ -23,7 +23,7 @@ Array = NDArray[np.float64]
 
 _VAGUE_SCALE = 2.0
 _SCALE_RANGE = (0.6, 1.6)
-_SMALLEST_ANGLE_DEG = 60.0
+SMALLEST_ANGLE_DEG = 60.0
 
 
 class CalibrationError(Exception):
@@ -104,10 +104,10 @@ class ImageJacobian:
                 )
         cosine = abs(self.columns[:, 0] @ self.columns[:, 2]) / (lengths[0] * lengths[2])
         angle_deg = float(np.degrees(np.arccos(min(1.0, cosine))))
-        if not angle_deg >= _SMALLEST_ANGLE_DEG:
+        if not angle_deg >= SMALLEST_ANGLE_DEG:
             raise CalibrationError(
                 f"axes {self.axes[0]} and {self.axes[1]} move the fiducial along lines only "
-                f"{angle_deg:.0f}° apart, expected at least {_SMALLEST_ANGLE_DEG:.0f}°"
+                f"{angle_deg:.0f}° apart, expected at least {SMALLEST_ANGLE_DEG:.0f}°"
             )
 
     def _regressors(self, change_mm: Mapping[str, float]) -> Array:

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.procedure.estimate import FiducialEstimate
-from service.procedure.jacobian import ImageJacobian
+from service.procedure.jacobian import CalibrationError, ImageJacobian
 
 Array = NDArray[np.float64]
 PLAN_VOID = "plan_void"
@@ -59,10 +59,14 @@ def plan_move(
 ) -> Plan:
     """Return the move that brings the fiducial from `estimate` to `target_mm` (image plane).
 
-    Raises PlanRefusedError if an axis would leave its travel, naming axis, setpoint and limits.
+    Raises PlanRefusedError if an axis would leave its travel, naming axis, setpoint and limits, or
+    if the image Jacobian leads to no move.
     """
     displacement = target_mm - estimate.plane_mm
-    change_mm = jacobian.setpoint_change_mm(displacement)
+    try:
+        change_mm = jacobian.setpoint_change_mm(displacement)
+    except CalibrationError as error:
+        raise PlanRefusedError(f"{error}: calibrate again") from error
     setpoints_um = dict(estimate.setpoints_um)
     for axis, change in change_mm.items():
         setpoints_um[axis] += round(change * 1000.0)

@@ -36,6 +36,11 @@ def command_id(case_uid: str, procedure_id: int, number: int) -> str:
     return f"{case_uid}/{procedure_id}/{number}"
 
 
+def measurement_name(case_uid: str, measurement_id: int) -> str:
+    """What the bridge calls a measurement: its journal goes on where a new case counts anew."""
+    return f"{case_uid}/{measurement_id}"
+
+
 def run_procedure(
     record: CaseRecord,
     procedure_id: int,

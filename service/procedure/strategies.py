@@ -20,7 +20,7 @@ from service.procedure.sensing import (
     measure_shift_set,
 )
 from service.procedure.steps import Acquired, Measured, ProcedureSteps
-from sr_engine.shiftset import paper_random
+from sr_engine.reconstruction.shiftset import paper_random
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ from collections.abc import Callable, Mapping
 from typing import Any
 
 from service.room.commands_procedure import ProcedureCommands
+from service.room.commands_proposals import ProposalCommands
 from service.room.commands_record import RecordCommands
 from service.room.commands_robot import RobotCommands
 from service.room.commands_target import TargetCommands
@@ -34,6 +35,7 @@ class Commands:
 
 def _all_of(room: Room, robot: RobotCommands) -> tuple[Callable[..., Any], ...]:
     target, procedure, record = TargetCommands(room), ProcedureCommands(room), RecordCommands(room)
+    proposals = ProposalCommands(room, target)
     return (
         robot.reset,
         robot.note_stop,
@@ -56,4 +58,8 @@ def _all_of(room: Room, robot: RobotCommands) -> tuple[Callable[..., Any], ...]:
         record.describe_case,
         record.compare_clocks,
         record.forget_clock,
+        proposals.propose,
+        proposals.take_proposal,
+        proposals.refuse_proposal,
+        proposals.note_registration,
     )

@@ -7,6 +7,8 @@ from service.room.alarms import Condition
 from service.room.prompt import plain_words
 from service.room.state import RoomState
 
+HANGS = "does not get on"
+
 
 def conditions(state: RoomState) -> list[Condition]:
     """What is wrong now, most urgent first; each with what to do about it."""
@@ -31,7 +33,7 @@ def conditions(state: RoomState) -> list[Condition]:
         text = "The robot's position is not certain"
         found.append(Condition("position", "warning", text, "Re-arm, then measure."))
     for process in state.processes:
-        if process.condition in ("down", "old"):
+        if process.condition == "down" or process.detail == HANGS:
             text = f"The {process.name} {process.detail}"
             found.append(
                 Condition(f"{process.name}_lost", "alarm", text, f"Start the {process.name} again.")

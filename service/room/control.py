@@ -17,6 +17,7 @@ from typing import Any
 
 import structlog
 
+from case_record.cases import Cases
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Procedure
 from room_config.load import Config
@@ -25,24 +26,34 @@ from service.procedure.recording import Place
 from service.procedure.registry import build_procedure, result_to_json
 from service.procedure.runner import ReplayMismatchError, run_procedure
 from service.procedure.sensing import ProcedureFailedError
+from service.procedure.steps import Outcome, Step
 from service.procedure.targets import ENTRY_SET, TARGET_SET
 from service.room.alarms import Condition
 from service.room.commands import Commands
 from service.room.context import Room
-from service.room.describe import Describer
+from service.room.describe import Describer, describe_robot
 from service.room.execution import Execution, ProcedureAbortedError
 from service.room.link import RoomLink
 from service.room.readiness import ConflictError
 from service.room.state import RoomState
+from service.room.trouble import RECORD_FAULTS, Trouble, held
 
 _TICK_S = 0.002
+_HOLD_TICK_S = 0.02
+_TRIED_AGAIN_S = 0.5
+_SAID_AGAIN_S = 60.0
+# while another has the record locked for longer, the loop holds: it must not be kept from the link
+_BUSY_TIMEOUT_S = 0.5
+# a published state that is older is not what the room is doing now: nobody may be shown it as such
+STALE_S = 1.0
+NOTE_STOP = "note_stop"
 _PUBLISH_EVERY_S = 0.1
 _LEAST_BETWEEN_STATES_S = 0.02
 _PATIENCE_S = 30.0
 # what may be done while the robot moves; all else waits for standstill and is refused meanwhile
 _WHILE_MOVING = frozenset(
     {
-        "note_stop",
+        NOTE_STOP,
         "abort",
         "answer",  # no question is open then: refused as stale
         "describe_case",
@@ -50,6 +61,9 @@ _WHILE_MOVING = frozenset(
         "confirm_acquisition",
         "give_up_slices",
         "set_entry",
+        "propose",
+        "refuse_proposal",
+        "note_registration",
     }
 )
 log = structlog.get_logger()
@@ -72,9 +86,14 @@ class ControlLoop:
         config: Config,
         link: RoomLink,
         others_wrong: Callable[[], Sequence[Condition]] = tuple,
+        on_failure: Callable[[], None] = lambda: None,
     ) -> None:
-        """others_wrong: what else is an alarm now; must answer at once."""
+        """others_wrong: what else is an alarm now; must answer at once.
+
+        on_failure: called, in the loop's thread, when the loop has ended by itself.
+        """
         self._config = config
+        self._cases = Cases(*config.room.folders)
         self._link = link
         self._others_wrong = others_wrong
         self._link.client.while_moving = self._while_moving
@@ -82,15 +101,24 @@ class ControlLoop:
         self._published_change = (0, 0)
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="control", daemon=True)
-        self._published_at_s = 0.0
+        self._published_at_s = time.monotonic()
         self._state = RoomState.initial(config)
         self._failure: BaseException | None = None
+        self._on_failure = on_failure
+        self._trouble = Trouble()
+        self._failed_at: tuple[int, str] | None = None
+        self._said_s = -_SAID_AGAIN_S
         self._commands: Commands | None = None
 
     @property
     def state(self) -> RoomState:
         """The newest published state; safe to read from any thread."""
         return self._state
+
+    @property
+    def state_age_s(self) -> float:
+        """How long ago it was published, by a clock that nobody sets."""
+        return time.monotonic() - self._published_at_s
 
     @property
     def failure(self) -> BaseException | None:
@@ -124,61 +152,114 @@ class ControlLoop:
     def stop(self, by: str, *, emergency: bool = False) -> None:
         """Stop the robot now, from any thread; the procedure that runs is aborted."""
         self._link.client.request_stop(emergency=emergency)
-        self._queue.put(_Asked("note_stop", {"by": by, "emergency": emergency}, Future()))
+        self._queue.put(_Asked(NOTE_STOP, {"by": by, "emergency": emergency}, Future()))
 
     # From here on everything runs in the loop's own thread
 
     def _run(self) -> None:
         try:
-            with CaseRecord(self._config.room.case_dir, create=True) as record:
-                self._serve(record)
-        except _Closing:
-            pass
+            while not self._closing.is_set():
+                self._work_until_it_fails()
         except BaseException as error:
             self._failure = error
             log.exception("control loop ended")
             self._link.client.request_stop()
         finally:
             self._link.client.close()
+            self._commands = None
+            if self._failure is not None:
+                self._on_failure()
+
+    def _work_until_it_fails(self) -> None:
+        try:
+            with CaseRecord(
+                self._cases.required(), create=True, busy_timeout_s=_BUSY_TIMEOUT_S
+            ) as record:
+                self._serve(record)
+        except _Closing:
+            return
+        except Exception as error:
+            if self._trouble.begin(error):
+                log.exception("the control loop holds")
+            self._hold()
 
     def _serve(self, record: CaseRecord) -> None:
         case = record.start_case(self._config.room.name, seed=0)
+        self._trouble.settle(record)
         execution = Execution(self._config, record, self._link, self._tick)
         self._commands = Commands(Room(self._config, record, self._link, execution))
         self._record, self._execution = record, execution
         self._describer = Describer(self._config, record, self._link, self._others_wrong)
-        while not self._closing.is_set():
+        while True:
             self._tick()
             running = record.running_procedure()
             if running is not None:
-                self._run_one(running.procedure_id, case.case_uid)
+                self._run_one(running, case.case_uid)
 
-    def _run_one(self, procedure_id: int, case_uid: str) -> None:
-        record, execution = self._record, self._execution
-        running = record.running_procedure()
-        assert running is not None
-        source = {"procedure_id": procedure_id, "name": running.name}
+    def _hold(self) -> None:
+        """For a while: keep the link, show what is wrong, refuse orders; then it is tried again."""
+        if self._commands is not None and self._execution.aborting is not None:
+            self._trouble.abort = self._execution.aborting
+        self._commands = None
+        until_s = time.monotonic() + _TRIED_AGAIN_S
+        while time.monotonic() < until_s and not self._closing.is_set():
+            self._refuse_queue()
+            self._publish_held(self._trouble.condition(), self._trouble.since_s)
+            self._link.pump(_HOLD_TICK_S)
+
+    def _run_one(self, running: Procedure, case_uid: str) -> None:
+        """Run a procedure to its end; what it raises ends it and nothing else.
+
+        Where the record is at fault it stays `running` and goes on from there, as after a crash.
+        """
+        calls = 0
+
+        def execute(step: Step, command_id: str) -> Outcome:
+            nonlocal calls
+            calls += 1
+            return self._execution.execute(step, command_id)
+
         try:
             procedure = build_procedure(running)
-            result = run_procedure(record, procedure_id, procedure, execution.execute, case_uid)
+            number = running.procedure_id
+            result = run_procedure(self._record, number, procedure, execute, case_uid)
         except _Closing:
-            return  # the procedure stays `running`: the next start goes on with it
-        except (ProcedureFailedError, ProcedureAbortedError, ReplayMismatchError) as error:
-            state = "aborted" if isinstance(error, ProcedureAbortedError) else "failed"
-            with record.transaction():
-                record.end_procedure(procedure_id, state, {"reason": str(error)})
-                record.append_event(
-                    f"procedure_{state}", {**source, "reason": str(error)}, source="service"
-                )
+            raise  # the procedure stays `running`: the next start goes on with it
+        except ProcedureAbortedError as error:
+            self._end_procedure(running, "aborted", str(error))
+        except (ProcedureFailedError, ReplayMismatchError) as error:
+            self._end_procedure(running, "failed", str(error))
+        except RECORD_FAULTS as error:
+            # the record could be written in between, and yet: then it is not the record's fault
+            before, self._failed_at = self._failed_at, (running.procedure_id, str(error))
+            if before != self._failed_at or calls > 1:
+                raise
+            self._fail_by_program(running, error)
+        except Exception as error:
+            self._fail_by_program(running, error)
         else:
-            with record.transaction():
-                record.end_procedure(procedure_id, "done", result_to_json(result))
-                if isinstance(result, Place | GuidePlace):
-                    self._make_target(running, result)
-                record.append_event("procedure_done", source, source="service")
-        finally:
-            execution.clear()
+            self._finish_procedure(running, result)
+        self._execution.clear()
         self._publish()
+
+    def _fail_by_program(self, running: Procedure, error: Exception) -> None:
+        log.exception("procedure failed", procedure=running.name)
+        text = f"the program failed ({type(error).__name__}: {error}); its log says where"
+        self._end_procedure(running, "failed", text)
+
+    def _end_procedure(self, running: Procedure, state: str, reason: str) -> None:
+        body = {"procedure_id": running.procedure_id, "name": running.name, "reason": reason}
+        with self._record.transaction():
+            self._record.end_procedure(running.procedure_id, state, {"reason": reason})
+            self._record.append_event(f"procedure_{state}", body, source="service")
+
+    def _finish_procedure(self, running: Procedure, result: Any) -> None:
+        body = {"procedure_id": running.procedure_id, "name": running.name}
+        with self._record.transaction():
+            self._record.end_procedure(running.procedure_id, "done", result_to_json(result))
+            if isinstance(result, Place | GuidePlace):
+                self._make_target(running, result)
+            self._record.append_event("procedure_done", body, source="service")
 
     def _make_target(self, recorded: Procedure, place: Place | GuidePlace) -> None:
         """The place that was recorded is the target from now on; a needle's line has an entry."""
@@ -220,7 +301,27 @@ class ControlLoop:
                 asked = self._queue.get_nowait()
             except queue.Empty:
                 return
-            _answer(self._commands, asked, moving, self._publish)
+            try:
+                _answer(self._commands, asked, moving, self._publish)
+            except RECORD_FAULTS:
+                if asked.name == NOTE_STOP:
+                    self._trouble.owe_stop(**asked.arguments)
+                raise
+
+    def _refuse_queue(self) -> None:
+        """While the loop holds: a STOP is owed to the record, all else is refused."""
+        while True:
+            try:
+                asked = self._queue.get_nowait()
+            except queue.Empty:
+                return
+            if not asked.future.set_running_or_notify_cancel():
+                continue
+            if asked.name == NOTE_STOP:
+                self._trouble.owe_stop(**asked.arguments)
+                asked.future.set_result(None)
+            else:
+                asked.future.set_exception(self._trouble.refusal())
 
     def _publish_if_due(self) -> bool:
         """Publish when something was recorded, and every now and then; whether it was done."""
@@ -234,9 +335,27 @@ class ControlLoop:
         return False
 
     def _publish(self) -> None:
-        self._published_at_s = time.monotonic()
         self._published_change = self._record.change_count()
-        self._state = self._describer.describe(self._execution, self._state)
+        try:
+            state = self._describer.describe(self._execution, self._state)
+        except RECORD_FAULTS:
+            raise
+        except Exception as error:
+            wrong = f"The state cannot be told ({type(error).__name__}: {error})"
+            self._publish_held(Condition("state", "alarm", wrong, "See the log."), time.time())
+            if time.monotonic() - self._said_s > _SAID_AGAIN_S:
+                self._said_s = time.monotonic()
+                log.exception("state")
+            return
+        self._show(state)
+
+    def _publish_held(self, wrong: Condition, since_s: float) -> None:
+        robot = describe_robot(self._link, self._state.robot)
+        self._show(held(self._state, robot, wrong, since_s))
+
+    def _show(self, state: RoomState) -> None:
+        self._published_at_s = time.monotonic()
+        self._state = state
 
 
 class _Closing(Exception):
@@ -244,7 +363,10 @@ class _Closing(Exception):
 
 
 def _answer(commands: Commands, asked: _Asked, moving: bool, publish: Callable[[], None]) -> None:
-    """Carry out what was asked; the state that shows it is published before the answer is given."""
+    """Carry out what was asked; the state that shows it is published before the answer is given.
+
+    Raises where the record is at fault, after whoever asked was told.
+    """
     if not asked.future.set_running_or_notify_cancel():
         return  # whoever asked has given up waiting: not carried out
     try:
@@ -260,3 +382,5 @@ def _answer(commands: Commands, asked: _Asked, moving: bool, publish: Callable[[
     except Exception as error:
         log.exception("command failed", command=asked.name)
         asked.future.set_exception(error)
+        if isinstance(error, RECORD_FAULTS):
+            raise

@@ -6,13 +6,14 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
+from case_record.cases import Cases
 from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
 from room_config.load import Config
 from service.procedure.targets import current_entry, current_target
 from service.room.alarms import AlarmBook, Condition
-from service.room.conditions import conditions
+from service.room.conditions import HANGS, conditions
 from service.room.describe_measurement import (
     describe_error,
     describe_measurement,
@@ -22,6 +23,7 @@ from service.room.describe_measurement import (
 from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.prompt import is_calibrated, outcome_text, prompt
+from service.room.proposals import ProposalBook
 from service.room.readiness import may_start, ready_arrival
 from service.room.state import (
     AcquisitionState,
@@ -37,7 +39,8 @@ from service.room.state import (
 )
 
 PROCESSES = ("listener", "worker")
-_BEAT_IS_OLD_S = 3.0
+_BEAT_IS_OLD_S = 1.0
+_BEAT_IS_LOST_S = 3.0
 _LOOK_EVERY_S = 0.25
 
 
@@ -53,9 +56,11 @@ class Describer:
     ) -> None:
         self._others_wrong = others_wrong
         self._config = config
+        self._home = Cases(*config.room.folders).home
         self._record = record
         self._link = link
         self._alarms = AlarmBook()
+        self._proposals = ProposalBook()
         self._processes: list[ProcessState] = []
         self._look_at_s = 0.0
         self._around_id = 0
@@ -78,7 +83,7 @@ class Describer:
                 "ready": arrival is not None,
                 "arrival": arrival,
                 "punctured": arrival is not None and _punctured(record, arrival.procedure_id),
-                "robot": _robot(link, before.robot),
+                "robot": describe_robot(link, before.robot),
                 "jog_possible": may_start(record, link.status) is None,
                 "hold": _hold(record),
                 **_slices(record),
@@ -91,6 +96,7 @@ class Describer:
                 "error": describe_error(config, record, target_mm),
                 "event_id": record.last_event_id(),
                 "processes": self._look_at_processes(),
+                "proposals": self._proposals.update(record),
             }
         )
         alarms = self._alarms.update([*conditions(state), *self._others_wrong()], record)
@@ -113,7 +119,7 @@ class Describer:
             self._look_at_s = time.monotonic() + _LOOK_EVERY_S
             self._processes = [
                 ProcessState(name=p.name, **_condition(p.seen, p.running, p.beat_age_s))
-                for p in who_is_alive(self._config.room.case_dir, PROCESSES)
+                for p in who_is_alive(self._home, PROCESSES)
             ]
         return self._processes
 
@@ -123,12 +129,15 @@ def _condition(seen: bool, running: bool, beat_age_s: float) -> dict[str, str]:
         return {"condition": "none", "detail": "has not run on this case yet"}
     if not running:
         return {"condition": "down", "detail": "has ended"}
+    if beat_age_s > _BEAT_IS_LOST_S:
+        return {"condition": "old", "detail": HANGS}
     if beat_age_s > _BEAT_IS_OLD_S:
-        return {"condition": "old", "detail": "does not get on"}
+        return {"condition": "old", "detail": "is quiet"}
     return {"condition": "up", "detail": ""}
 
 
-def _robot(link: RoomLink, before: RobotState) -> RobotState:
+def describe_robot(link: RoomLink, before: RobotState) -> RobotState:
+    """The bridge as it last said it was; without a link as it was, and that it is not linked."""
     status = link.status
     if status is None:
         return before.model_copy(update={"linked": False, "problem": link.problem})

@@ -11,7 +11,7 @@ from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
 from dicom_slice.geometry import SliceGeometry
 from room_config.load import Config
-from service.procedure.estimate import probability_within
+from service.procedure.estimate import axis_sigma, probability_within
 from service.procedure.registry import latest_calibration
 from service.room.state import ErrorState, FiducialState, MeasurementState, ReconstructionState
 
@@ -120,7 +120,7 @@ def describe_error(
         row_mm=float(offset[0]),
         col_mm=float(offset[1]),
         error_mm=float(np.linalg.norm(offset)),
-        sigma_mm=float(np.sqrt(np.trace(covariance) / 2)),
+        sigma_mm=axis_sigma(covariance),
         probability_within_tolerance=probability_within(
             offset, covariance, config.service.tolerance_mm
         ),

@@ -14,6 +14,7 @@ from robot_bridge.protocol.messages import CommandState
 from robot_bridge.protocol.phases import WorkPhase, motion_allowed
 from room_config.load import Config
 from service.procedure.plan import PLAN_VOID, why_void
+from service.procedure.runner import measurement_name
 from service.procedure.steps import (
     Acquire,
     Acquired,
@@ -111,7 +112,10 @@ class Execution:
 
     def _move(self, step: MoveTo, command_id: str) -> Moved:
         phase = _phase_of(step.purpose)
-        measurement = None if step.rests_on is None else str(step.rests_on)
+        case_uid = command_id.split("/")[0]
+        measurement = None
+        if step.rests_on is not None:
+            measurement = measurement_name(case_uid, step.rests_on)
         while True:
             self._wait_until_ready_to_move()
             void = self._why_void(step, command_id)

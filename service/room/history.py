@@ -8,14 +8,14 @@ from pathlib import Path
 
 import numpy as np
 
-from case_record.record import FILE_NAME, CaseRecord, CaseRecordError
+from case_record.cases import Cases
+from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Measurement
+from service.procedure.estimate import axis_sigma
 from service.procedure.plane import ImagePlane
 from service.procedure.registry import APPROACHES
 from service.procedure.targets import TARGET_SET, TARGET_WITHDRAWN, current_target, target_of
 from service.room.summaries import CaseSummary, KnownTarget, MeasurementBody
-
-_MOST_CASES = 200
 
 
 @dataclass(frozen=True)
@@ -60,7 +60,7 @@ class Targets:
 
 
 def _sigma_mm(covariance_mm2: list[list[float]]) -> float:
-    return float(np.sqrt(np.trace(np.array(covariance_mm2)) / 2))
+    return axis_sigma(covariance_mm2)
 
 
 def known_targets(record: CaseRecord) -> list[KnownTarget]:
@@ -92,31 +92,13 @@ def targets_over_time(record: CaseRecord) -> Targets:
     )
 
 
-def case_folder(case_dir: Path, name: str | None) -> Path:
-    """The folder of the present case (None) or of one beside it; CaseRecordError if there is none.
-
-    Only names of folders that are there and hold a record lead anywhere: no path gets through.
-    """
-    if name is None:
-        return case_dir
-    for folder in _case_folders(case_dir):
-        if folder.name == name:
-            return folder
-    raise CaseRecordError(f"There is no case in a folder {name!r} beside the present one.")
-
-
-def _case_folders(case_dir: Path) -> list[Path]:
-    beside = (path.parent for path in case_dir.parent.glob(f"*/{FILE_NAME}"))
-    return sorted({case_dir, *beside})[:_MOST_CASES]
-
-
-def past_cases(case_dir: Path) -> list[CaseSummary]:
-    """Every case folder beside `case_dir`, and itself, newest first; nothing is written there."""
+def past_cases(cases: Cases) -> list[CaseSummary]:
+    """Every case of the room, newest first; nothing is written there."""
     summaries = []
-    for folder in _case_folders(case_dir):
+    for folder in cases.folders():
         try:
             with CaseRecord(folder, read_only=True) as record:
-                summaries.append(_summary(record, folder, folder == case_dir))
+                summaries.append(_summary(record, folder, folder == cases.open))
         except CaseRecordError:
             continue  # a record of a newer program, or none: not ours to show
     return sorted(summaries, key=lambda case: -case.created_s)

@@ -7,6 +7,8 @@ from collections import deque
 from collections.abc import Callable
 from typing import Any
 
+import structlog
+
 from robot_bridge.client.client import (
     BridgeClient,
     BridgeError,
@@ -17,7 +19,7 @@ from robot_bridge.client.client import (
 from robot_bridge.protocol.phases import ALLOWED, WorkPhase
 
 _REOPEN_EVERY_S = 0.5
-_OPEN_TIMEOUT_S = 1.0
+_OPEN_TIMEOUT_S = 0.5
 
 
 class PumpedClient(BridgeClient):
@@ -66,8 +68,11 @@ class RoomLink:
             self.client.pump(wait_s)
         except BridgeError as error:
             self.lost(error)
+        except Exception as error:
+            structlog.get_logger().exception("robot link")
+            self.lost(error)
 
-    def lost(self, error: BridgeError) -> None:
+    def lost(self, error: Exception) -> None:
         """Note that the session is gone; the bridge stops the robot by itself."""
         self.is_up = False
         self.problem = str(error)
@@ -77,7 +82,9 @@ class RoomLink:
     def _open(self) -> None:
         try:
             hello = self.client.open(_OPEN_TIMEOUT_S)
-        except BridgeError as error:
+        except Exception as error:
+            if not isinstance(error, BridgeError):
+                structlog.get_logger().exception("robot link")
             if str(error) != self.problem:
                 self._on_change(f"no link: {error}")
             self.problem = str(error)

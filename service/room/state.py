@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from room_config.load import Config
+from service.room.proposals import ProposalState
 
 
 class _Frozen(BaseModel):
@@ -222,6 +223,7 @@ class RoomState(_Frozen):
     arrival_mode: bool = False
     processes: list[ProcessState] = []
     alarms: list[AlarmState] = []
+    proposals: list[ProposalState] = []
 
     @classmethod
     def initial(cls, config: Config) -> RoomState:

@@ -2,26 +2,50 @@
 
 | device | type | what |
 | --- | --- | --- |
-| AutoSPINe | STATUS | what is going on; not ready while the robot does not answer |
-| Fiducials | POINT | the fiducials where they were measured last, in their size |
+| AutoSPINe | STATUS | what is going on; its code says whether the robot is ready for orders |
+| Fiducials | POINT | where the fiducials are, in their size: `fiducial`, or `upper`, `lower` |
 | Targets | POINT | target and entry, if they are set |
-| NeedleGuide | TRANSFORM | needle tip and direction (its z axis) once two fiducials tell them |
+| NeedleGuide | TRANSFORM | needle tip and direction (its z axis) while READY from two fiducials |
 | Slice | IMAGE | the newest slice |
-| SuperResolution | IMAGE | the newest reconstruction |
+| SuperResolution | IMAGE | the reconstruction of the fiducials that are shown |
+
+Every device is always in the scene, for a receiver keeps what it was told until it is told
+otherwise: what there is not, or what ended, is an empty list, a transform whose meta-data
+`TransformStatus` is INVALID, or a black image whose `ImageStatus` is.
 """
 
 from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from case_record.record import CaseRecord
 from dicom_slice.geometry import SliceGeometry
+from room_config.service import GuideConfig
 from service.room.images import ImageMissingError, reconstruction_pixels, slice_pixels
-from service.room.state import ArrivalState, ReconstructionState, RoomState, SliceState
+from service.room.state import (
+    ArrivalState,
+    FiducialState,
+    MeasurementState,
+    ReconstructionState,
+    RobotState,
+    RoomState,
+    SliceState,
+)
 from service.slicer.messages import (
+    IMAGE_STATUS,
+    INVALID,
+    STATUS_HARDWARE_FAILURE,
+    STATUS_MANUAL,
     STATUS_NOT_READY,
     STATUS_OK,
+    STATUS_PANIC,
+    TRANSFORM_STATUS,
+    VALID,
+    Message,
     Point,
     image,
     points,
@@ -30,72 +54,159 @@ from service.slicer.messages import (
 )
 
 Array = NDArray[np.float64]
-Scene = dict[str, bytes]
+Scene = dict[str, Message]
 
 _FIDUCIAL_RGB, _TARGET_RGB, _ENTRY_RGB = (255, 200, 0), (0, 255, 120), (0, 160, 255)
 
 
-def scene_of(state: RoomState) -> Scene:
-    """Everything but the images. A list that has become empty is sent as such."""
-    scene = {
+@dataclass(frozen=True)
+class Standing:
+    """What of a state is true now; what is not is None."""
+
+    measurement: MeasurementState | None
+    other_fiducial: FiducialState | None
+    arrival: ArrivalState | None
+    reconstruction: ReconstructionState | None
+
+
+def standing(state: RoomState) -> Standing:
+    """The one place that asks whether what was seen still holds."""
+    robot, seen = state.robot, state.measurement
+    still = robot.linked and robot.position_certain and not robot.moving
+    shown = seen if still and seen is not None and seen.patient_mm is not None else None
+    other = state.other_fiducial if shown else None
+    made = state.reconstruction
+    numbers = {one.measurement_id for one in (shown, other) if one is not None}
+    return Standing(
+        measurement=shown,
+        other_fiducial=other,
+        arrival=state.arrival if state.ready else None,
+        reconstruction=made if made is not None and made.measurement_id in numbers else None,
+    )
+
+
+def scene_of(state: RoomState, guide: GuideConfig | None = None) -> Scene:
+    """Everything but the images. guide: of a room with two fiducials."""
+    now = standing(state)
+    return {
         "AutoSPINe": _status(state),
-        "Fiducials": points("Fiducials", _measured_s(state), _fiducials(state)),
+        "Fiducials": points("Fiducials", _measured_s(state), _fiducials(state, now, guide)),
         "Targets": points("Targets", state.at_s, _targets(state)),
+        "NeedleGuide": _needle(state.at_s, now.arrival),
     }
-    if state.arrival is not None and state.arrival.tip_mm is not None:
-        scene["NeedleGuide"] = _needle(state.at_s, state.arrival)
-    return scene
+
+
+def stale(state: RoomState) -> RoomState:
+    """A state that is old: nobody knows what the room does now, and where its guide is."""
+    text = "The control loop does not say what the room is doing."
+    robot = state.robot.model_copy(update={"linked": False, "problem": text, "phase": "STALE"})
+    change = {"robot": robot, "ready": False, "procedure": None, "prompt": text}
+    return state.model_copy(update=change)
 
 
 class Images:
-    """The images of a scene, each encoded once."""
+    """The images of a scene, each made once."""
 
     def __init__(self) -> None:
-        self._shown: dict[str, tuple[int, bytes]] = {}
+        self._shown: dict[str, tuple[tuple[str, int], Message]] = {}
 
-    def of(self, state: RoomState, record: CaseRecord) -> Scene:
-        """Reads the record and files; what is not there any more is left out."""
-        if state.slice is not None:
-            shown = state.slice
-            at_s = shown.acquired_to_s or shown.received_s
-            self._show("Slice", shown.slice_id, at_s, shown, record)
-        if state.reconstruction is not None:
-            made = state.reconstruction
-            self._show("SuperResolution", made.measurement_id, _measured_s(state), made, record)
-        return {device: encoded for device, (_, encoded) in self._shown.items()}
+    def of(self, state: RoomState, record: CaseRecord | None) -> Scene:
+        """Reads the record and files; what there is not (any more) is black."""
+        made = standing(state).reconstruction
+        acquired_s = (state.slice.acquired_to_s or state.slice.received_s) if state.slice else 0.0
+        number = made.measurement_id if made else 0
+        slice_id = state.slice.slice_id if state.slice else 0
+        self._show("Slice", (state.case_uid, slice_id), acquired_s, state.slice, record)
+        self._show("SuperResolution", (state.case_uid, number), _measured_s(state), made, record)
+        return {device: shown for device, (_, shown) in self._shown.items()}
 
     def _show(
         self,
         device: str,
-        number: int,
+        key: tuple[str, int],
         at_s: float,
-        shown: SliceState | ReconstructionState,
-        record: CaseRecord,
+        shown: SliceState | ReconstructionState | None,
+        record: CaseRecord | None,
     ) -> None:
-        if device in self._shown and self._shown[device][0] == number:
+        if device in self._shown and self._shown[device][0] == key:
             return
-        read = slice_pixels if isinstance(shown, SliceState) else reconstruction_pixels
-        try:
-            pixels = read(record, number)
-        except ImageMissingError:
-            return
-        self._shown[device] = number, image(device, at_s, pixels, _geometry(shown))
+        made = None if shown is None or record is None else _image(device, at_s, shown, record)
+        self._shown[device] = key, made or _no_image(device, at_s)
 
 
-def _status(state: RoomState) -> bytes:
-    code = STATUS_OK if state.robot.linked else STATUS_NOT_READY
-    name = "READY" if state.ready else state.procedure or state.robot.phase
-    return status("AutoSPINe", state.at_s, code, name, state.prompt)
+def _image(
+    device: str, at_s: float, shown: SliceState | ReconstructionState, record: CaseRecord
+) -> Message | None:
+    try:
+        if isinstance(shown, SliceState):
+            number, pixels = shown.slice_id, slice_pixels(record, shown.slice_id)
+        else:
+            result = record.measurement(shown.measurement_id).result or {}
+            number = int(result["slice_id"])
+            pixels = reconstruction_pixels(record, shown.measurement_id)
+    except ImageMissingError:
+        return None
+    header = record.slice(number).header
+    meta = {IMAGE_STATUS: VALID, **_of_slice(header)}
+    thickness_mm = header.get("slice_thickness_mm") or 1.0
+    return image(device, at_s, pixels, _geometry(shown), thickness_mm, meta)
 
 
-def _fiducials(state: RoomState) -> list[Point]:
+def _of_slice(header: Mapping[str, object]) -> dict[str, str]:
+    uid = header.get("frame_of_reference_uid")
+    return {"FrameOfReferenceUID": str(uid)} if uid else {}
+
+
+def _no_image(device: str, at_s: float) -> Message:
+    one = SliceGeometry((0.0, 0.0, 0.0), (0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (1.0, 1.0), (1, 1))
+    return image(device, at_s, np.zeros((1, 1)), one, meta={IMAGE_STATUS: INVALID})
+
+
+def status_of(state: RoomState, device: str, name: str = "") -> Message:
+    """What is going on, under a device name; name: of the state, or else the robot's phase."""
+    return status(device, state.at_s, code_of(state.robot), name or state.robot.phase, state.prompt)
+
+
+def code_of(robot: RobotState) -> int:
+    """OK only while the robot could take an order."""
+    if not robot.linked:
+        return STATUS_NOT_READY
+    if robot.phase == "EMERGENCY":
+        return STATUS_PANIC
+    if robot.fault:
+        return STATUS_HARDWARE_FAILURE
+    if robot.stopped or not robot.armed or not robot.position_certain:
+        return STATUS_NOT_READY
+    return STATUS_MANUAL if robot.phase == "MANUAL" else STATUS_OK
+
+
+def _status(state: RoomState) -> Message:
+    name = "READY" if standing(state).arrival else state.procedure or state.robot.phase
+    return status_of(state, "AutoSPINe", name)
+
+
+def _fiducials(state: RoomState, now: Standing, guide: GuideConfig | None) -> list[Point]:
+    """By name, not by which was seen last: receivers tell them apart by place in the list too."""
     found = []
-    last, other = state.measurement, state.other_fiducial
-    if last is not None and last.patient_mm is not None:
-        found.append(Point("fiducial", last.patient_mm, 2 * (last.radius_mm or 0.0), _FIDUCIAL_RGB))
-    if other is not None:
-        found.append(Point("other", other.patient_mm, 2 * other.radius_mm, _FIDUCIAL_RGB))
-    return found
+    if now.measurement is not None and now.measurement.patient_mm is not None:
+        found.append((now.measurement.patient_mm, now.measurement.radius_mm or 0.0))
+    if now.other_fiducial is not None:
+        found.append((now.other_fiducial.patient_mm, now.other_fiducial.radius_mm))
+    named = [
+        Point(_fiducial_name(state, guide, place), place, 2 * radius_mm, _FIDUCIAL_RGB)
+        for place, radius_mm in found
+    ]
+    return sorted(named, key=lambda point: point.name, reverse=True)
+
+
+def _fiducial_name(
+    state: RoomState, guide: GuideConfig | None, place: tuple[float, float, float]
+) -> str:
+    if guide is None or state.slice is None:
+        return "fiducial"
+    along_mm = float(_geometry(state.slice).normal @ place)
+    is_upper = abs(along_mm - guide.upper_slice_mm) < abs(along_mm - guide.lower_slice_mm)
+    return "upper" if is_upper else "lower"
 
 
 def _targets(state: RoomState) -> list[Point]:
@@ -106,14 +217,23 @@ def _targets(state: RoomState) -> list[Point]:
     return [Point(name, place, rgb=rgb) for name, place, rgb in named if place is not None]
 
 
-def _needle(at_s: float, arrival: ArrivalState) -> bytes:
+def _needle(at_s: float, arrival: ArrivalState | None) -> Message:
     """At the tip; z goes on as the needle does, x lies in the slice as near to a row as it can."""
+    if arrival is None or arrival.tip_mm is None:
+        return transform("NeedleGuide", at_s, np.eye(3), np.zeros(3), {TRANSFORM_STATUS: INVALID})
     tip, joint = np.array(arrival.tip_mm), np.array(arrival.joint_mm)
-    along = (tip - joint) / np.linalg.norm(tip - joint)
-    across = np.array([1.0, 0.0, 0.0]) - along[0] * along
+    axes = axes_along((tip - joint) / np.linalg.norm(tip - joint))
+    return transform("NeedleGuide", at_s, axes, tip, {TRANSFORM_STATUS: VALID})
+
+
+def axes_along(direction: Array) -> Array:
+    """(3, 3): right-handed columns whose z is the unit vector (3,), x as near to patient x as
+    that lets it be.
+    """
+    start = np.eye(3)[0 if abs(direction[0]) < 0.9 else 2]
+    across = start - (start @ direction) * direction
     across /= np.linalg.norm(across)
-    axes = np.stack([across, np.cross(along, across), along], axis=1)
-    return transform("NeedleGuide", at_s, axes, tip)
+    return np.stack([across, np.cross(direction, across), direction], axis=1)
 
 
 def _measured_s(state: RoomState) -> float:

@@ -7,11 +7,11 @@ is the exception and goes onto the line at once. Errors are RFC 9457 problem det
 from __future__ import annotations
 
 import asyncio
-import time
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from pathlib import Path
 from typing import Any, Protocol
+from urllib.parse import urlsplit
 
 import structlog
 from fastapi import FastAPI, Response
@@ -21,9 +21,10 @@ from fastapi.staticfiles import StaticFiles
 from prometheus_client import CollectorRegistry, generate_latest
 from prometheus_client.registry import Collector
 
+from case_record.cases import Cases
 from room_config.load import Config
 from service.dicom_out.outbox_watch import OutboxWatch
-from service.room.control import ControlLoop
+from service.room.control import STALE_S, ControlLoop
 from service.room.link import PumpedClient, RoomLink
 from service.web.access import Access, AccessRules
 from service.web.event_stream import Broadcast
@@ -37,6 +38,7 @@ from service.web.routes.images import measurement_image_router, slice_image_rout
 from service.web.routes.live import live_router
 from service.web.routes.outputs import outbox_router, output_router
 from service.web.routes.procedure import procedure_router
+from service.web.routes.proposals import proposal_router
 from service.web.routes.record import event_router, measurement_router, slice_router
 from service.web.routes.record_edits import clerk_router
 from service.web.routes.robot import robot_router, stop_router
@@ -45,7 +47,6 @@ from service.web.schemas import Health
 
 PAGE = Path(__file__).parents[1] / "page"
 _HOUR_S = 3600.0
-_LOOP_IS_OLD_S = 3.0
 
 
 class Scene(Receivers, Protocol):
@@ -60,16 +61,18 @@ def create_app(
     config: Config,
     announce: Callable[[], None] = lambda: None,
     scene: Callable[[ControlLoop], Scene] | None = None,
+    on_failure: Callable[[], None] = lambda: None,
 ) -> FastAPI:
     """Wire the service of one room; `announce` is called when it is ready to serve.
 
+    on_failure: called when the control loop has ended by itself: the process is of no use then.
     scene: makes the server at which others follow the case, from the control loop.
     """
     service = config.service
     client = PumpedClient(service.bridge_link, name="service", heartbeat_s=service.heartbeat_s)
     link = RoomLink(client, _log_link)
     outbox = OutboxWatch(config)
-    loop = ControlLoop(config, link, outbox.conditions)
+    loop = ControlLoop(config, link, outbox.conditions, on_failure)
     broadcast = Broadcast(config, loop)
     receivers = None if scene is None else scene(loop)
 
@@ -101,25 +104,27 @@ def create_app(
     )
     uses_tls = service.tls_certificate is not None
     access = Access(access_rules(config))
-    app.add_middleware(Gate, access=access, uses_tls=uses_tls)
+    app.add_middleware(Gate, access=access, uses_tls=uses_tls, public_url=service.public_url)
     add_problems(app)
-    case_dir, orders = config.room.case_dir, Orders(loop)
+    app.state.cases = Cases(*config.room.folders)
+    orders = Orders(loop)
     for router in (
         stop_router(loop),
         live_router(loop, broadcast),
-        event_router(case_dir),
-        slice_router(case_dir),
-        measurement_router(case_dir),
-        slice_image_router(case_dir),
-        measurement_image_router(case_dir),
-        output_router(case_dir),
+        event_router(),
+        slice_router(),
+        measurement_router(),
+        slice_image_router(),
+        measurement_image_router(),
+        output_router(),
         outbox_router(config),
-        document_router(case_dir),
+        document_router(),
         robot_router(orders),
         target_router(orders),
+        proposal_router(orders),
         procedure_router(orders),
         clerk_router(orders),
-        access_router(access, uses_tls=uses_tls),
+        access_router(access, cookie_path=urlsplit(service.public_url).path or "/"),
     ):
         app.include_router(router)
     _add_health(app, loop, RoomMetrics(loop, link, broadcast, receivers), outbox)
@@ -182,8 +187,8 @@ def parts_of(loop: ControlLoop) -> dict[str, str]:
 def _loop_health(loop: ControlLoop) -> str:
     if loop.failure is not None:
         return f"ended: {loop.failure}"
-    age_s = time.time() - loop.state.at_s
-    return "ok" if age_s < _LOOP_IS_OLD_S else f"has said nothing for {age_s:.0f} s"
+    age_s = loop.state_age_s
+    return "ok" if age_s < STALE_S else f"has said nothing for {age_s:.0f} s"
 
 
 def _add_page(app: FastAPI) -> None:

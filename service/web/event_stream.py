@@ -1,4 +1,4 @@
-"""Server-sent events: the state whenever it changes, each new event of the record, a beat a second.
+"""Server-sent events: the state when it changes, each new event of the record, and often a beat.
 
 One thread watches the control loop and encodes once; the viewers only pass bytes on and have no
 timers of their own, so that many of them cost little. `id:` is the record's event id; a client that
@@ -17,14 +17,15 @@ from collections.abc import AsyncIterator
 
 import structlog
 
-from case_record.record import CaseRecord, CaseRecordError
+from case_record.cases import Cases
+from case_record.record import CaseRecord
 from case_record.rows import Event
 from room_config.load import Config
 from service.room.control import ControlLoop
 
 _WATCH_S = 0.01
 _LEAST_BETWEEN_STATES_S = 0.04
-_BEAT_S = 1.0
+_BEAT_S = 0.3
 _AGAIN_S = 1.0
 _KEPT_EVENTS = 1000
 _EVENTS_AT_ONCE = 100
@@ -34,7 +35,7 @@ class Broadcast:
     """`start` it in the server's event loop, `close` it at the end; each viewer gets `follow`."""
 
     def __init__(self, config: Config, loop: ControlLoop) -> None:
-        self._case_dir = config.room.case_dir
+        self._cases = Cases(*config.room.folders)
         self._loop = loop
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._watch, name="broadcast", daemon=True)
@@ -62,8 +63,8 @@ class Broadcast:
         while not self._closing.is_set():
             try:
                 self._watch_record()
-            except CaseRecordError as error:
-                structlog.get_logger().error("event stream", error=str(error))
+            except Exception as error:  # whatever it is, the screens must go on being told
+                structlog.get_logger().exception("event stream", error=str(error))
                 self._beat_if_due()
                 self._closing.wait(_AGAIN_S)
 
@@ -72,7 +73,7 @@ class Broadcast:
             if self._closing.wait(_WATCH_S):
                 return
             self._beat_if_due()
-        with CaseRecord(self._case_dir) as record:
+        with CaseRecord(self._cases.required()) as record:
             if not self._newest_id:
                 self._newest_id = max(0, record.last_event_id() - _KEPT_EVENTS)
             revision = -1
@@ -93,7 +94,9 @@ class Broadcast:
         """Tells how old the state is: a control loop that hangs is noticed on every screen."""
         if time.monotonic() - self._told_s < _BEAT_S:
             return
-        body = json.dumps({"at_s": self._loop.state.at_s, "now_s": time.time()})
+        loop = self._loop
+        told = {"at_s": loop.state.at_s, "now_s": time.time(), "age_s": round(loop.state_age_s, 3)}
+        body = json.dumps(told)
         self._tell(None, [], f"event: beat\ndata: {body}\n\n".encode())
 
     def _tell(
@@ -176,7 +179,7 @@ class Broadcast:
     def _recorded(self, after_id: int) -> tuple[bytes, int]:
         if not self._loop.state.case_uid:
             return b"", after_id
-        with CaseRecord(self._case_dir) as record:
+        with CaseRecord(self._cases.required()) as record:
             events = record.events(after_id, _EVENTS_AT_ONCE)
         if not events:
             return b"", after_id

@@ -16,12 +16,13 @@ After = Annotated[
 ]
 Limit = Annotated[int, Query(ge=1, le=1000)]
 Newest = Annotated[bool, Query(description="The newest first instead of the oldest first.")]
-ERRORS = responses(401, 422, 429)
-ERRORS_WITH_ID = responses(401, 404, 422, 429)
+ERRORS = responses(401, 404, 409, 422, 429)  # of no such case, of none that is open
+ERRORS_WITH_ID = ERRORS
 
 
 def link_onward(request: Request, response: Response, ids: list[int], limit: int) -> None:
     """Name the next page in the `Link` header, if this one is full."""
     if len(ids) == limit:
         onward = request.url.include_query_params(after=ids[-1])
-        response.headers["Link"] = f'<{onward.path}?{onward.query}>; rel="next"'
+        path = f"{request.state.prefix}{onward.path}"
+        response.headers["Link"] = f'<{path}?{onward.query}>; rel="next"'

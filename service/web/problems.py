@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import sqlite3
 from collections.abc import Mapping
 from concurrent.futures import TimeoutError as CommandTimeoutError
 from http import HTTPStatus
@@ -17,7 +18,8 @@ from fastapi.responses import JSONResponse
 from pydantic import BaseModel, Field
 from starlette.exceptions import HTTPException
 
-from case_record.record import CaseRecordError
+from case_record.cases import CasesError, NoCaseError
+from case_record.record import CaseRecordError, RecordUnavailableError
 from service.room.images import ImageMissingError
 from service.room.readiness import ConflictError
 
@@ -91,9 +93,23 @@ def add_problems(app: FastAPI) -> None:
     async def conflict(_: Request, error: ConflictError) -> JSONResponse:
         return problem(409, error.code, str(error))
 
+    @app.exception_handler(NoCaseError)
+    async def no_case(_: Request, error: NoCaseError) -> JSONResponse:
+        return problem(409, "no_case", str(error))
+
+    @app.exception_handler(CasesError)
+    async def cases(_: Request, error: CasesError) -> JSONResponse:
+        return problem(409, "cases", str(error))
+
     @app.exception_handler(CaseRecordError)
     async def unknown(_: Request, error: CaseRecordError) -> JSONResponse:
         return problem(404, "not_found", str(error))
+
+    @app.exception_handler(RecordUnavailableError)
+    @app.exception_handler(sqlite3.OperationalError)
+    async def unusable(_: Request, error: Exception) -> JSONResponse:
+        detail = f"The case record cannot be used now ({error}): try again."
+        return problem(503, "record_unusable", detail)
 
     @app.exception_handler(ImageMissingError)
     async def no_image(_: Request, error: ImageMissingError) -> JSONResponse:

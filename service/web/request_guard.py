@@ -9,14 +9,15 @@ from __future__ import annotations
 
 import time
 from http.cookies import CookieError, SimpleCookie
-from urllib.parse import urlsplit
 
 import structlog
 from starlette.datastructures import Headers, MutableHeaders
-from starlette.responses import Response
+from starlette.responses import RedirectResponse, Response
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from room_config.networks import address_of
 from service.web.access import ANYBODY, Access, Identity, LockedOutError
+from service.web.origins import OriginRules, is_foreign_site
 from service.web.problems import ProblemError, problem
 
 COOKIE = "autospine_session"
@@ -24,7 +25,6 @@ STOP_PATH = "/api/v1/stop"
 SESSION_PATH = "/api/v1/session"
 _MOST_BODY_BYTES = 64 * 1024
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
-_LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
 _PUBLIC = frozenset({"/", "/healthz"})
 
 SECURITY_HEADERS = {
@@ -41,18 +41,28 @@ SECURITY_HEADERS = {
 
 
 class Gate:
-    """Wraps the application; puts the caller's `Identity` into `scope["state"]`."""
+    """Wraps the application; puts the caller's `identity` and public_url's path (`prefix`) into
+    `scope["state"]`.
+    """
 
-    def __init__(self, app: ASGIApp, access: Access, *, uses_tls: bool) -> None:
+    def __init__(
+        self, app: ASGIApp, access: Access, *, uses_tls: bool, public_url: str = ""
+    ) -> None:
         self._app = app
         self._access = access
         self._uses_tls = uses_tls
+        self._origins = OriginRules(public_url, needs_token=access.rules.needs_token)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http":
             await self._app(scope, receive, send)
             return
         send = self._with_headers(send)
+        if scope["path"] == self._origins.path and self._origins.path:
+            # the page's own addresses are relative: they need the slash
+            await RedirectResponse(f"{self._origins.path}/", 308)(scope, receive, send)
+            return
+        scope = self._below_prefix(scope)
         try:
             self._let_in(scope)
             if scope["method"] not in _SAFE:
@@ -64,6 +74,14 @@ class Gate:
             await answer(scope, receive, send)
             return
         await self._app(scope, receive, send)
+
+    def _below_prefix(self, scope: Scope) -> Scope:
+        """A proxy that does not strip the path prefix of public_url: it is stripped here."""
+        prefix = self._origins.path
+        if not prefix or not scope["path"].startswith(f"{prefix}/"):
+            return scope
+        path = scope["path"].removeprefix(prefix)
+        return {**scope, "path": path, "raw_path": path.encode()}
 
     def _with_headers(self, send: Send) -> Send:
         async def sending(message: Message) -> None:
@@ -80,8 +98,8 @@ class Gate:
     def _let_in(self, scope: Scope) -> None:
         headers = Headers(scope=scope)
         path, method = scope["path"], scope["method"]
-        self._check_origin(headers, method)
-        scope.setdefault("state", {})["identity"] = ANYBODY
+        self._check_origin(headers, method, path)
+        scope.setdefault("state", {}).update(identity=ANYBODY, prefix=self._origins.path)
         if not self._access.rules.needs_token or _is_public(path, method):
             return
         identity = self._who(scope, headers, path)
@@ -94,15 +112,16 @@ class Gate:
             detail = f"{identity.name} is a viewer: viewers may look and press STOP only."
             raise ProblemError(403, "wrong_role", detail)
 
-    def _check_origin(self, headers: Headers, method: str) -> None:
-        """No other web page may use this browser's way to us."""
-        host = headers.get("host", "")
-        if not self._access.rules.needs_token and _host_name(host) not in _LOOPBACK:
-            detail = f"Without tokens this service is asked for by a loopback name, not {host!r}."
-            raise ProblemError(403, "wrong_host", detail)
-        origin = headers.get("origin")
-        if origin is not None and method not in _SAFE and urlsplit(origin).netloc != host:
-            raise ProblemError(403, "cross_origin", "Orders from other web pages are not taken.")
+    def _check_origin(self, headers: Headers, method: str, path: str) -> None:
+        """No other web page may use this browser's way to us; a STOP only not if it says so."""
+        if path == STOP_PATH and not is_foreign_site(headers):
+            return
+        why = self._origins.why_not_host(headers)
+        if why is not None:
+            raise ProblemError(403, "wrong_host", why)
+        why = None if method in _SAFE else self._origins.why_not_origin(headers)
+        if why is not None:
+            raise ProblemError(403, "cross_origin", why)
 
     def _who(self, scope: Scope, headers: Headers, path: str) -> Identity:
         """The caller, by bearer token or by session cookie; raises ProblemError."""
@@ -127,7 +146,7 @@ class Gate:
 
 def check_token(access: Access, scope: Scope, token: str) -> Identity:
     """Return the token's owner; raises PermissionError, or ProblemError 429 during a lock-out."""
-    address = scope["client"][0] if scope.get("client") else "unknown"
+    address = _caller_address(scope)
     try:
         return access.check_token(token, address, now_s=time.monotonic(), wall_s=time.time())
     except PermissionError:
@@ -138,6 +157,17 @@ def check_token(access: Access, scope: Scope, token: str) -> Identity:
         raise ProblemError(429, "locked_out", str(error), wait) from None
 
 
+def _caller_address(scope: Scope) -> str:
+    """Who is locked out after wrong tokens; what a proxy says of it need not be an address."""
+    client = scope.get("client")
+    if not client:
+        return "unknown"
+    try:
+        return str(address_of(client[0]))
+    except ValueError:
+        return str(client[0])
+
+
 def unauthorized(detail: str) -> ProblemError:
     return ProblemError(401, "unauthorized", detail, {"WWW-Authenticate": "Bearer"})
 
@@ -146,10 +176,6 @@ def _is_public(path: str, method: str) -> bool:
     if path in _PUBLIC or path.startswith("/page/"):
         return method in _SAFE
     return path == SESSION_PATH and method == "POST"
-
-
-def _host_name(host: str) -> str:
-    return (urlsplit(f"//{host}").hostname or "") if host else ""
 
 
 def _cookie(headers: Headers) -> str:

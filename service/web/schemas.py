@@ -51,6 +51,15 @@ class TargetBody(PointBody):
     )
 
 
+class TakeBody(Ask):
+    """Take a proposal over; what only the operator can say must be said."""
+
+    in_water: bool = Field(
+        description="True: the target is a place in tissue; false: where the fiducial is to be."
+    )
+    label: str = Field(default="", max_length=80)
+
+
 class AnswerBody(Ask):
     """The answer to the question that the state shows, named by its id."""
 

@@ -22,12 +22,6 @@ from dicom_slice.header import Rescale, Slice
 from dicom_slice.quirks import MR_IMAGE, Kind
 from dicom_slice.times import AcquisitionInterval
 
-SHARED = Path(__file__).parents[2].parent / "shared" / "dicom"
-
-needs_shared = pytest.mark.skipif(
-    not SHARED.is_dir(), reason=f"the real MR data is not there ({SHARED})"
-)
-
 
 def needs_program(name: str) -> pytest.MarkDecorator:
     return pytest.mark.skipif(shutil.which(name) is None, reason=f"{name} is not installed")

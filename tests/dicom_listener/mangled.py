@@ -3,7 +3,8 @@
 import random
 from pathlib import Path
 
-from listener_room import SHARED, mr_data_set
+from listener_room import mr_data_set
+from real_slices import DICOM
 
 # One of each encoding and layout; a few kilobytes each where there is a choice.
 SOURCES = (
@@ -28,7 +29,7 @@ def sources(folder: Path) -> list[bytes]:
     """Bytes of the files to mangle: the real ones where they are there, and one of our own."""
     made = folder / "made.dcm"
     mr_data_set().save_as(made, enforce_file_format=True)
-    real = [SHARED / name for name in SOURCES if (SHARED / name).is_file()]
+    real = [DICOM / name for name in SOURCES if (DICOM / name).is_file()]
     return [made.read_bytes(), *(path.read_bytes() for path in real)]
 
 

@@ -5,11 +5,12 @@ import time
 from pathlib import Path
 
 import pytest
-from listener_room import SHARED, begin_hold, mr_data_set, needs_shared
+from listener_room import begin_hold, mr_data_set
 from mangled import mangled
 from pydicom import dcmread
 from pydicom.dataset import Dataset
 from pydicom.sequence import Sequence
+from real_slices import DICOM
 
 from case_record.record import CaseRecord
 from dicom_listener.clock import ClockRules
@@ -161,11 +162,10 @@ def test_set_aside_files_are_removed_after_their_retention_and_used_ones_never(m
     assert desk.record.events()[-1].kind == "files_removed"
 
 
-@needs_shared
 def test_a_file_on_which_the_codec_aborts_is_set_aside_and_the_next_is_taken(make_desk):
     """The bytes of kept seed 2785: GDCM ends the process that decodes them."""
     desk = make_desk(slices=SliceRules(coronal_tolerance_deg=None))
-    source = SHARED / "dicom2nifti/hdr/jpegll.dcm"
+    source = DICOM / "dicom2nifti/hdr/jpegll.dcm"
     bad, jpeg_lossless = mangled(source.read_bytes(), 2785), "1.2.840.10008.1.2.4.70"
     start = 144 + int.from_bytes(bad[140:144], "little")
     uid = str(dcmread(source).SOPInstanceUID)

@@ -4,9 +4,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from listener_room import SHARED, a_slice, mr_data_set, needs_shared
+from listener_room import a_slice, mr_data_set
 from pydicom import dcmread
 from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian
+from real_slices import DICOM
 
 from dicom_slice.header import read_header, slices_of
 from dicom_slice.pixels import check_pixels, magnitude_pixels
@@ -65,9 +66,8 @@ def test_padding_becomes_zero_and_never_a_value(tmp_path):
     np.testing.assert_allclose(pixels[5:], STORED[5:] * 3.0)
 
 
-@needs_shared
 def test_a_real_slice_deflated_or_inverted_gives_the_same_pixels(tmp_path):
-    source = SHARED / "hazen/nist_T2_site3_ge_plate4/Z815"
+    source = DICOM / "hazen/nist_T2_site3_ge_plate4/Z815"
     wanted = magnitude_pixels(source)
     data_set = dcmread(source)
     data_set.file_meta.TransferSyntaxUID = DeflatedExplicitVRLittleEndian

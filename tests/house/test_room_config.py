@@ -39,6 +39,12 @@ def test_the_environment_overrides_the_file(tmp_path):
     ("text", "expected"),
     [
         (MINIMAL.replace('name = "test room"', ""), "missing key room.name"),
+        (MINIMAL.replace("case_dir", "cases_dir").replace('"case"', "7"), "key room.cases_dir"),
+        (MINIMAL.replace('case_dir = "case"', ""), "key room: .*cases_dir is missing"),
+        (
+            MINIMAL.replace("[service]", 'cases_dir = "cases"\n[service]'),
+            "key room: .*cases_dir and case_dir exclude each other",
+        ),
         (MINIMAL + "tolerance_m = 1", "unknown key service.tolerance_m .*tolerance_mm"),
         (MINIMAL + "tolerance_mm = -1", "key service.tolerance_mm: .*got -1"),
         (MINIMAL + "tolerance_mm = nan", "key service.tolerance_mm"),

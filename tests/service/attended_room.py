@@ -12,9 +12,9 @@ from typing import TypeVar
 import numpy as np
 
 from room_config.shell import autospine
-from service.client import RoomClient
+from service.client import RoomClient, ServiceGoneError
 from service.room.state import RoomState
-from simulator.demo_room import DemoOptions, DemoRoom
+from simulator.demo.room import DemoOptions, DemoRoom
 from simulator.truth_client import TruthAddress, ask_path
 
 Seen = TypeVar("Seen")
@@ -80,10 +80,14 @@ def wait_for(
 ) -> Seen:
     """Look until it is as wanted; the last look is in the error."""
     deadline_s = time.monotonic() + timeout_s
+    seen: Seen | ServiceGoneError
     while True:
-        seen = look()
-        if wanted(seen):
-            return seen
+        try:
+            seen = look()
+            if wanted(seen):
+                return seen
+        except ServiceGoneError as error:  # for a moment it does not know: on a busy machine
+            seen = error
         assert time.monotonic() < deadline_s, f"after {timeout_s:.0f} s still {seen}"
         time.sleep(0.02)
 

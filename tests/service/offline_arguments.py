@@ -5,7 +5,7 @@ import numpy as np
 from service.procedure.approach import ApproachArguments
 from service.procedure.calibration import Calibration, CalibrationArguments
 from service.procedure.sensing import ValidationGate
-from sr_engine.shiftset import named
+from sr_engine.reconstruction.shiftset import named
 
 GATE = ValidationGate(
     position_gate_mm=3.0, gate_sigma=5.0, repeatability_mm=0.014, scale_error=0.015

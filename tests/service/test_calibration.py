@@ -12,7 +12,7 @@ from service.procedure.steps import MoveTo
 from service.procedure.strategies import STRATEGIES, look_at_fiducial
 from simulator.config import Fiducial, StaticObject, VirtualRoom
 from simulator.stage_physics import StageParameters
-from sr_engine.shiftset import named
+from sr_engine.reconstruction.shiftset import named
 from studies.offline_room import MrImaging, OfflineRoom
 
 ORIGIN = {"xt": 0, "yt": 0}

@@ -29,7 +29,7 @@ from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steps import Acquire
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
-from sr_engine.shiftset import named
+from sr_engine.reconstruction.shiftset import named
 from studies.offline_room import MrImaging
 from studies.recorded_room import RecordedRoom
 

@@ -9,14 +9,13 @@ from pathlib import Path
 import numpy as np
 import pydicom
 import pytest
+from real_slices import DICOM
 from virtual_slices import write_slice
 
 from simulator.config import VirtualRoom
 from simulator.scene import true_fiducial_mm
 
 AUTOSPINE = Path(sys.executable).parent / "autospine"
-DICOM = Path(__file__).parents[2].parent / "shared" / "dicom"
-needs_real_data = pytest.mark.skipif(not DICOM.is_dir(), reason="the real MR data is not here")
 QUARTER_MM = {"a": (-0.25, -0.25), "b": (-0.25, 0.25), "c": (0.25, -0.25), "d": (0.25, 0.25)}
 
 
@@ -168,7 +167,6 @@ def test_a_slice_without_a_round_object_says_so(shifted, tmp_path):
     assert "no round object" in result.stderr
 
 
-@needs_real_data
 def test_the_vials_of_the_real_coronal_phantom_are_found():
     series = DICOM / "hazen" / "nist_T2_site3_ge_plate4"
     result = autospine("locate", series, "--radius-mm", "3,12", "--json")

@@ -28,7 +28,7 @@ from service.procedure.sensing import ABORT, RESCAN, ProcedureFailedError
 from service.procedure.steps import AskOperator, Measure, Moved, MoveTo
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
-from sr_engine.shiftset import named
+from sr_engine.reconstruction.shiftset import named
 from studies.offline_room import MrImaging, OfflineRoom
 from studies.recorded_room import RecordedRoom
 

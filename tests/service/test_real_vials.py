@@ -1,7 +1,6 @@
 """`autospine locate` on every real coronal phantom series: the vials are found in the slices."""
 
 import collections
-import csv
 import json
 import subprocess
 import sys
@@ -9,21 +8,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from real_slices import DICOM, manifest, needs_large_set
 
 AUTOSPINE = Path(sys.executable).parent / "autospine"
-DICOM = Path(__file__).parents[2].parent / "shared" / "dicom"
 VIALS = 14
 SAME_OBJECT_PX = 2.0
 
-pytestmark = [
-    pytest.mark.soak,
-    pytest.mark.skipif(not DICOM.is_dir(), reason="the real MR data is not here"),
-]
+pytestmark = [pytest.mark.soak, needs_large_set]
 
 
 def series_with_vials() -> dict[str, list[str]]:
-    with (DICOM / "manifest.csv").open(newline="") as file:
-        paths = [r["path"] for r in csv.DictReader(file) if r["round_object"] == "yes"]
+    paths = [r["path"] for r in manifest() if r["round_object"] == "yes"]
     series = collections.defaultdict(list)
     for path in paths:
         if "/nist_T" in path:

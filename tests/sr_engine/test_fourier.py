@@ -10,14 +10,14 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from sr_engine import shiftset
-from sr_engine.blur import Blur
 from sr_engine.errors import NotFiniteError, ParameterError, ShapeError, SingularShiftSetError
-from sr_engine.fourier import Prior, prepare_filters, reconstruct_fourier
 from sr_engine.frames import Region
-from sr_engine.ibp import PAPER, reconstruct_ibp
 from sr_engine.psf import Psf
-from sr_engine.reconstruct import reconstruct
+from sr_engine.reconstruction import shiftset
+from sr_engine.reconstruction.blur import Blur
+from sr_engine.reconstruction.fourier import Prior, prepare_filters, reconstruct_fourier
+from sr_engine.reconstruction.ibp import PAPER, reconstruct_ibp
+from sr_engine.reconstruction.reconstruct import reconstruct
 from sr_engine.simulate import render_disc
 
 Array = NDArray[np.float64]

@@ -8,8 +8,8 @@ from skimage.filters import threshold_otsu
 
 from sr_engine.errors import ConstantFrameError, NoRoundObjectError, NotFiniteError, ParameterError
 from sr_engine.hough import HoughSettings, hough_circles, otsu_threshold, strongest_circle
-from sr_engine.interpolate import enlarge_bicubic, fine_from_frame, frame_from_fine
 from sr_engine.psf import Psf
+from sr_engine.reconstruction.interpolate import enlarge_bicubic, fine_from_frame, frame_from_fine
 from sr_engine.simulate import render_disc, rician
 
 WIDE = HoughSettings((3.0, 14.0), sensitivity=0.92)

@@ -6,12 +6,18 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sr_engine import shiftset
-from sr_engine.blur import Blur
 from sr_engine.errors import ParameterError, ShapeError
-from sr_engine.ibp import PAPER, Stopping, estimate_noise_sigma, reconstruct_ibp, view_matrix
 from sr_engine.psf import Psf
-from sr_engine.reconstruct import reconstruct
+from sr_engine.reconstruction import shiftset
+from sr_engine.reconstruction.blur import Blur
+from sr_engine.reconstruction.ibp import (
+    PAPER,
+    Stopping,
+    estimate_noise_sigma,
+    reconstruct_ibp,
+    view_matrix,
+)
+from sr_engine.reconstruction.reconstruct import reconstruct
 from sr_engine.simulate import render_disc, rician
 
 Array = NDArray[np.float64]

@@ -18,7 +18,7 @@ from dicom_slice.reasons import UnusableError
 from sr_engine.detect import detect
 from sr_engine.errors import EngineError, ParameterError
 from sr_engine.localize import localize
-from sr_engine.resolution import radius_seen_px
+from sr_engine.reconstruction.resolution import radius_seen_px
 from sr_engine.simulate import render_disc, rician
 
 AUTOSPINE = Path(sys.executable).parent / "autospine"

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from sr_engine import shiftset
 from sr_engine.errors import (
     AmbiguousObjectError,
     ConstantFrameError,
@@ -20,9 +19,10 @@ from sr_engine.errors import (
     ShapeError,
 )
 from sr_engine.hough import HoughSettings
-from sr_engine.ibp import PAPER
 from sr_engine.localize import localize
 from sr_engine.paper import PaperSettings, localize_paper, sigma_px
+from sr_engine.reconstruction import shiftset
+from sr_engine.reconstruction.ibp import PAPER
 from sr_engine.simulate import render_disc, rician
 
 Array = NDArray[np.float64]

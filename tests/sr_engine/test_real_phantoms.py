@@ -1,32 +1,26 @@
 """Real phantom slices: the vials are found, and nothing round where nothing is."""
 
-import csv
-from pathlib import Path
-
 import numpy as np
 import pydicom
 import pytest
+from real_slices import DICOM, manifest, needs_large_set
 
 from sr_engine.detect import detect
 from sr_engine.errors import EngineError
 from sr_engine.locate import locate_all
 
-DATA = Path(__file__).parents[2].parent / "shared" / "dicom"
-pytestmark = [
-    pytest.mark.skipif(not (DATA / "manifest.csv").is_file(), reason="no real slices beside us"),
-    pytest.mark.filterwarnings("ignore"),  # pydicom warns of what vendors write
-]
+# pydicom warns of what vendors write
+pytestmark = pytest.mark.filterwarnings("ignore")
 VIAL_RADII_MM = (4.5, 12.0)
 
 
 def _rows(part: str) -> list[dict[str, str]]:
-    with (DATA / "manifest.csv").open(newline="") as file:
-        return [row for row in csv.DictReader(file) if part in row["path"]]
+    return [row for row in manifest() if part in row["path"]]
 
 
 def _pixels(path: str) -> tuple[np.ndarray, float]:
     """Rescaled pixels of the first frame, and the spacing in mm."""
-    data_set = pydicom.dcmread(DATA / path, force=True)
+    data_set = pydicom.dcmread(DICOM / path, force=True)
     pixels = data_set.pixel_array.astype(float)
     pixels = pixels[0] if pixels.ndim == 3 else pixels
     slope = float(getattr(data_set, "RescaleSlope", 1) or 1)
@@ -35,8 +29,6 @@ def _pixels(path: str) -> tuple[np.ndarray, float]:
 
 
 def _series() -> list[str]:
-    if not (DATA / "manifest.csv").is_file():
-        return []
     return sorted({row["rep_group"] for row in _rows("nist_") if row["rep_group"]})
 
 
@@ -55,6 +47,7 @@ def test_the_fourteen_vials_and_three_posts_of_a_plate_are_seen(series: str) -> 
     assert seen >= 0.95 * total
 
 
+@needs_large_set
 def test_every_vial_of_a_slice_is_located_with_its_wall() -> None:
     pixels, spacing = _pixels(
         sorted(row["path"] for row in _rows("nist_T2_site4_philips_plate4"))[0]
@@ -66,9 +59,10 @@ def test_every_vial_of_a_slice_is_located_with_its_wall() -> None:
     assert np.median([np.max(f.sigma_px) for f in found]) < 0.02
 
 
-@pytest.mark.parametrize(
-    "part", ["snr_philips_cor", "snr_ge_sag", "noise_only", "dicom2nifti/hdr", "prisma_phase"]
-)
+NOTHING_ROUND = ("snr_philips_cor", "snr_ge_sag", "noise_only", "dicom2nifti/hdr", "prisma_phase")
+
+
+@pytest.mark.parametrize("part", [part for part in NOTHING_ROUND if _rows(part)])
 def test_a_file_without_a_round_object_yields_none(part: str) -> None:
     rows = [r for r in _rows(part) if r["subject"] in ("phantom", "pixels_scrambled")]
     assert rows
@@ -81,7 +75,10 @@ def test_a_file_without_a_round_object_yields_none(part: str) -> None:
         assert found == [], row["path"]
 
 
-@pytest.mark.parametrize("part", ["snr_pairs/SNR_BODY", "ghosting_philips", "epi_rep17"])
+LARGE_PHANTOMS = ("snr_pairs/SNR_BODY", "ghosting_philips", "epi_rep17")
+
+
+@pytest.mark.parametrize("part", [part for part in LARGE_PHANTOMS if _rows(part)])
 def test_a_single_large_phantom_is_located(part: str) -> None:
     row = _rows(part)[0]
     pixels, _ = _pixels(row["path"])

@@ -7,8 +7,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from sr_engine import shiftset
 from sr_engine.errors import NotFiniteError, ParameterError, ShapeError
+from sr_engine.reconstruction import shiftset
 
 IDEAL = [("quarter", 2), ("half", 2), ("lattice5", 2), ("third", 3), ("eighth", 4)]
 

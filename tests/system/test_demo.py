@@ -8,14 +8,14 @@ import urllib.request
 import pytest
 
 from case_record.record import CaseRecord
-from simulator.demo_room import known_faults
+from simulator.demo.room import known_faults
 from simulator.misassigned import misassigned, read_truth
 
 PROCESSES = {
-    "service": "command_line service",
-    "worker": "command_line worker",
-    "listener": "command_line listener",
-    "scanner": "command_line scanner",
+    "service": "cli.main service",
+    "worker": "cli.main worker",
+    "listener": "cli.main listener",
+    "scanner": "cli.main scanner",
     "bridge": "robot_bridge",
     "motors": "simulator.motors",
     "serial line": "simulator.serial_line",

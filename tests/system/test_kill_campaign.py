@@ -20,10 +20,10 @@ from simulator.truth_client import TruthAddress
 from simulator.unintended import TrueMotion, ask_motions, unintended_motions
 
 VICTIMS = {
-    "service": "command_line service",
-    "worker": "command_line worker",
-    "listener": "command_line listener",
-    "scanner": "command_line scanner",
+    "service": "cli.main service",
+    "worker": "cli.main worker",
+    "listener": "cli.main listener",
+    "scanner": "cli.main scanner",
     "bridge": "robot_bridge",
     "motors": "simulator.motors",
     "serial line": "simulator.serial_line",

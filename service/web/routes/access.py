@@ -8,12 +8,14 @@ from fastapi import APIRouter, Request, Response
 
 from service.web.access import Access, Identity
 from service.web.orders import Caller
+from service.web.origins import came_over_tls
 from service.web.problems import ProblemError, responses
 from service.web.request_guard import COOKIE, check_token, session_secret, unauthorized
 from service.web.schemas import LoginBody, SessionBody
 
 
-def access_router(access: Access, *, uses_tls: bool) -> APIRouter:
+def access_router(access: Access, *, cookie_path: str = "/") -> APIRouter:
+    """cookie_path: the path prefix below which the browser sees the page."""
     router = APIRouter(tags=["access"])
 
     @router.get("/api/v1/session", responses=responses(401, 429))
@@ -37,7 +39,8 @@ def access_router(access: Access, *, uses_tls: bool) -> APIRouter:
             max_age=int(access.rules.session_s),
             httponly=True,
             samesite="strict",
-            secure=uses_tls,
+            path=cookie_path,
+            secure=came_over_tls(request.headers, request.url.scheme),
         )
         return _body(access, identity)
 
@@ -45,7 +48,13 @@ def access_router(access: Access, *, uses_tls: bool) -> APIRouter:
     async def log_out(request: Request, response: Response) -> None:
         """Log out."""
         access.close_session(session_secret(request.headers))
-        response.delete_cookie(COOKIE, httponly=True, samesite="strict", secure=uses_tls)
+        response.delete_cookie(
+            COOKIE,
+            path=cookie_path,
+            httponly=True,
+            samesite="strict",
+            secure=came_over_tls(request.headers, request.url.scheme),
+        )
 
     return router
 

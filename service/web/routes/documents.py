@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import shutil
 from pathlib import Path
-from typing import Annotated
 
-from fastapi import APIRouter, Query
+from fastapi import APIRouter
 from fastapi.responses import FileResponse
 from starlette.background import BackgroundTask
 
-from service.room.history import case_folder
 from service.web.documents import Documents
+from service.web.of_case import OfCase
 from service.web.problems import responses
 
 _ERRORS = responses(401, 404, 409, 422, 429, 503)
@@ -22,18 +21,9 @@ _REPORT_POLICY = (
     "default-src 'none'; style-src 'unsafe-inline'; img-src data:; base-uri 'none'; "
     "form-action 'none'; frame-ancestors 'none'; sandbox"
 )
-CaseName = Annotated[
-    str | None,
-    Query(
-        alias="case",
-        min_length=1,
-        max_length=255,
-        description="Name of a folder that /api/v1/cases lists; left out: the present case.",
-    ),
-]
 
 
-def document_router(case_dir: Path) -> APIRouter:
+def document_router() -> APIRouter:
     router = APIRouter(tags=["documents"])
     documents = Documents()
 
@@ -42,9 +32,9 @@ def document_router(case_dir: Path) -> APIRouter:
         response_class=FileResponse,
         responses={**_ERRORS, 200: {"description": "The page", "content": {"text/html": _HTML}}},
     )
-    def report(case: CaseName = None) -> FileResponse:
+    def report(case: OfCase) -> FileResponse:
         """One page of a case: images, tables, plots. It loads nothing from anywhere."""
-        folder = case_folder(case_dir, case)
+        folder = case.folder
         path = documents.make("report", folder, f"{folder.name}-report.html")
         headers = {"Content-Security-Policy": _REPORT_POLICY, "Cache-Control": "no-store"}
         return FileResponse(
@@ -59,9 +49,9 @@ def document_router(case_dir: Path) -> APIRouter:
             200: {"description": "The zip", "content": {"application/zip": _BINARY}},
         },
     )
-    def export(case: CaseName = None) -> FileResponse:
+    def export(case: OfCase) -> FileResponse:
         """A case as one zip: every DICOM file as it was received, JSON lines, images."""
-        folder = case_folder(case_dir, case)
+        folder = case.folder
         name = f"{folder.name}.zip"
         path = documents.make("export", folder, name)
         return FileResponse(

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Callable
-from pathlib import Path
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query, Response
 from numpy.typing import NDArray
 
-from case_record.record import CaseRecord
 from service.room.images import (
     Rendering,
     png_of,
@@ -19,6 +17,7 @@ from service.room.images import (
     slice_file,
     slice_pixels,
 )
+from service.web.of_case import AskedCase, OfCase
 from service.web.pagination import Id
 from service.web.problems import responses
 
@@ -38,7 +37,7 @@ _BINARY = {"schema": {"type": "string", "format": "binary"}}
 
 def _answers(media_type: str) -> dict[int | str, dict[str, Any]]:
     return {
-        **responses(401, 404, 422, 429),
+        **responses(401, 404, 409, 422, 429),
         200: {"description": "The image", "content": {media_type: _BINARY}},
         304: {"description": "The caller has it already"},
     }
@@ -49,77 +48,93 @@ _RAW = _answers("application/octet-stream")
 _DICOM = _answers("application/dicom")
 
 
-def slice_image_router(case_dir: Path) -> APIRouter:
+def slice_image_router() -> APIRouter:
     router = APIRouter(tags=["images"], prefix="/api/v1/slices/{slice_id}")
 
     @router.get("/image.png", response_class=Response, responses=_PNG)
-    def slice_image(slice_id: Id, how: How, match: Match = None) -> Response:
+    def slice_image(slice_id: Id, case: OfCase, how: How, match: Match = None) -> Response:
         """The slice as an 8-bit PNG; window and level in the units of its magnitudes."""
-        with CaseRecord(case_dir) as record:
+        with case.record() as record:
             image = f"{record.slice(slice_id).sha256} {slice_id}"
-            return _png(image, lambda: slice_pixels(record, slice_id), how, match)
+            return _png(case, image, lambda: slice_pixels(record, slice_id), how, match)
 
     @router.get("/pixels", response_class=Response, responses=_RAW)
-    def raw_slice(slice_id: Id, match: Match = None) -> Response:
+    def raw_slice(slice_id: Id, case: OfCase, match: Match = None) -> Response:
         """The magnitudes, row by row, little-endian 32-bit floats; `X-Shape: rows,cols`."""
-        with CaseRecord(case_dir) as record:
+        with case.record() as record:
             image = f"{record.slice(slice_id).sha256} {slice_id}"
-            return _raw(image, slice_pixels(record, slice_id), match)
+            return _raw(case, image, slice_pixels(record, slice_id), match)
 
     @router.get("/image.dcm", response_class=Response, responses=_DICOM)
-    def dicom_file(slice_id: Id, match: Match = None) -> Response:
+    def dicom_file(slice_id: Id, case: OfCase, match: Match = None) -> Response:
         """The DICOM file, bit for bit as it was received."""
-        with CaseRecord(case_dir) as record:
+        with case.record() as record:
             path = slice_file(record, slice_id)
             key = f"dcm {record.slice(slice_id).sha256}"
         name = {"Content-Disposition": f'attachment; filename="slice-{slice_id}.dcm"'}
-        return _answer(key, match, "application/dicom", path.read_bytes, **name)
+        return _answer(case, key, match, "application/dicom", path.read_bytes, **name)
 
     return router
 
 
-def measurement_image_router(case_dir: Path) -> APIRouter:
+def measurement_image_router() -> APIRouter:
     router = APIRouter(tags=["images"], prefix="/api/v1/measurements/{measurement_id}")
 
-    def pixels_of(measurement_id: int) -> NDArray[Any]:
-        with CaseRecord(case_dir) as record:
+    def pixels_of(measurement_id: int, case: AskedCase) -> NDArray[Any]:
+        with case.record() as record:
             return reconstruction_pixels(record, measurement_id)
 
     @router.get("/image.png", response_class=Response, responses=_PNG)
-    def measurement_image(measurement_id: Id, how: How, match: Match = None) -> Response:
+    def measurement_image(
+        measurement_id: Id, case: OfCase, how: How, match: Match = None
+    ) -> Response:
         """The super-resolution reconstruction of a measurement as an 8-bit PNG."""
-        pixels = pixels_of(measurement_id)
-        return _png(f"{case_dir} measurement {measurement_id}", lambda: pixels, how, match)
+        pixels = pixels_of(measurement_id, case)
+        image = f"{case.folder} measurement {measurement_id}"
+        return _png(case, image, lambda: pixels, how, match)
 
     @router.get("/pixels", response_class=Response, responses=_RAW)
-    def raw_measurement(measurement_id: Id, match: Match = None) -> Response:
+    def raw_measurement(measurement_id: Id, case: OfCase, match: Match = None) -> Response:
         """The reconstruction as little-endian 32-bit floats; `X-Shape: rows,cols`."""
-        pixels = pixels_of(measurement_id)
-        return _raw(f"{case_dir} measurement {measurement_id}", pixels, match)
+        pixels = pixels_of(measurement_id, case)
+        return _raw(case, f"{case.folder} measurement {measurement_id}", pixels, match)
 
     return router
 
 
 def _answer(
-    key: str, match: str | None, media_type: str, make: Callable[[], bytes], **headers: str
+    case: AskedCase,
+    key: str,
+    match: str | None,
+    media_type: str,
+    make: Callable[[], bytes],
+    **headers: str,
 ) -> Response:
-    """The image, or 304 if the caller has it; what an ETag names never changes."""
+    """The image, or 304 if the caller has it; what an ETag names never changes.
+
+    An address that does not name the case means another image in the next one: no browser may show
+    it again without asking.
+    """
     etag = f'"{hashlib.sha256(key.encode()).hexdigest()[:32]}"'
-    cached = {"ETag": etag, "Cache-Control": "private, max-age=86400, immutable"}
+    how_long = "max-age=86400, immutable" if case.is_named else "no-cache"
+    cached = {"ETag": etag, "Cache-Control": f"private, {how_long}"}
     if match is not None and etag in match:
         return Response(status_code=304, headers=cached)
     return Response(make(), media_type=media_type, headers={**cached, **headers})
 
 
 def _png(
-    image: str, pixels: Callable[[], NDArray[Any]], how: Rendering, match: str | None
+    case: AskedCase,
+    image: str,
+    pixels: Callable[[], NDArray[Any]],
+    how: Rendering,
+    match: str | None,
 ) -> Response:
     key = f"png {image} {how.window} {how.level} {how.scale}"
-    return _answer(key, match, "image/png", lambda: png_of(pixels(), how))
+    return _answer(case, key, match, "image/png", lambda: png_of(pixels(), how))
 
 
-def _raw(image: str, pixels: NDArray[Any], match: str | None) -> Response:
+def _raw(case: AskedCase, image: str, pixels: NDArray[Any], match: str | None) -> Response:
     shape = {"X-Shape": ",".join(map(str, pixels.shape))}
-    return _answer(
-        f"raw {image}", match, "application/octet-stream", lambda: raw_of(pixels), **shape
-    )
+    octets = "application/octet-stream"
+    return _answer(case, f"raw {image}", match, octets, lambda: raw_of(pixels), **shape)

@@ -7,7 +7,7 @@ from typing import Annotated
 from fastapi import APIRouter, Header, Response
 from fastapi.responses import StreamingResponse
 
-from service.room.control import ControlLoop
+from service.room.control import STALE_S, ControlLoop
 from service.room.state import RoomState
 from service.web.event_stream import Broadcast
 from service.web.pagination import (
@@ -15,14 +15,18 @@ from service.web.pagination import (
     MOST_ID,
     After,
 )
+from service.web.problems import ProblemError, responses
 
 
 def live_router(loop: ControlLoop, broadcast: Broadcast) -> APIRouter:
     router = APIRouter(tags=["live"])
 
-    @router.get("/api/v1/state", response_model=RoomState, responses=ERRORS)
+    @router.get("/api/v1/state", response_model=RoomState, responses={**ERRORS, **responses(503)})
     async def state() -> Response:
-        """What the room is doing now."""
+        """What the room is doing now; 503 while the control loop does not say."""
+        if loop.state_age_s > STALE_S:
+            detail = f"The control loop has said nothing for {loop.state_age_s:.1f} s."
+            raise ProblemError(503, "stale_state", detail)
         # the state was checked when it was made; many ask for it often
         return Response(loop.state.model_dump_json(), media_type="application/json")
 

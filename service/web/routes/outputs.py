@@ -4,14 +4,12 @@ from __future__ import annotations
 
 import sys
 import threading
-from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
 from fastapi.responses import FileResponse
 from pydantic import BaseModel
 
-from case_record.record import CaseRecord
 from room_config.load import Config
 from service.dicom_out.finding import (
     finding_of_arrival,
@@ -22,7 +20,8 @@ from service.dicom_out.make import FOLDER, Kind, Output
 from service.dicom_out.outbox_store import FILE_NAME, STATES, OutboxStore, State
 from service.room.images import ImageMissingError
 from service.web.elsewhere import run_elsewhere
-from service.web.pagination import Id
+from service.web.of_case import AskedCase, OfCase
+from service.web.pagination import ERRORS, Id
 from service.web.problems import ProblemError, responses
 
 _PATIENCE_S = 180.0
@@ -76,21 +75,22 @@ class OutboxBody(BaseModel):
 def outbox_router(config: Config) -> APIRouter:
     router = APIRouter(tags=["outputs"])
 
-    @router.get("/api/v1/outbox", responses=responses(401, 422, 429))
+    @router.get("/api/v1/outbox", responses=ERRORS)
     def outbox(
+        case: OfCase,
         state: Annotated[State | None, Query(description="Only deliveries in this state.")] = None,
         limit: Annotated[int, Query(ge=1, le=1000)] = 200,
     ) -> OutboxBody:
         """Every destination and what became of the outputs there, the newest first."""
-        return _outbox(config, state, limit)
+        return _outbox(config, case, state, limit)
 
     return router
 
 
-def _outbox(config: Config, state: State | None, limit: int) -> OutboxBody:
+def _outbox(config: Config, case: AskedCase, state: State | None, limit: int) -> OutboxBody:
     lines, counts, deliveries = {}, {}, []
-    if (config.room.case_dir / FOLDER / FILE_NAME).is_file():
-        with OutboxStore(config.room.case_dir) as store:
+    if (case.folder / FOLDER / FILE_NAME).is_file():
+        with OutboxStore(case.folder) as store:
             lines, counts = store.lines(), store.counts()
             deliveries = [DeliveryBody(**vars(one)) for one in store.deliveries(limit, state)]
     destinations = []
@@ -112,9 +112,9 @@ def _outbox(config: Config, state: State | None, limit: int) -> OutboxBody:
     return OutboxBody(destinations=destinations, deliveries=deliveries)
 
 
-def output_router(case_dir: Path) -> APIRouter:
+def output_router() -> APIRouter:
     router = APIRouter(tags=["outputs"])
-    desk = _Desk(case_dir)
+    desk = _Desk()
 
     @router.get(
         "/api/v1/measurements/{measurement_id}/{kind}.dcm",
@@ -122,26 +122,30 @@ def output_router(case_dir: Path) -> APIRouter:
         responses=_DICOM,
     )
     def of_measurement(
-        measurement_id: Id, kind: Literal["image", "report", "presentation"]
+        measurement_id: Id, kind: Literal["image", "report", "presentation"], case: OfCase
     ) -> FileResponse:
         """Derived MR image, measurement report (SR), or presentation state of a measurement."""
-        return desk.hand_out(Output("measurement", measurement_id, kind))
+        return desk.hand_out(case, Output("measurement", measurement_id, kind))
 
     @router.get(
         "/api/v1/approaches/{procedure_id}/{kind}.dcm",
         response_class=FileResponse,
         responses=_DICOM,
     )
-    def of_approach(procedure_id: Id, kind: Literal["report", "presentation"]) -> FileResponse:
+    def of_approach(
+        procedure_id: Id, kind: Literal["report", "presentation"], case: OfCase
+    ) -> FileResponse:
         """Measurement report or presentation state of the READY at the end of an approach."""
-        return desk.hand_out(Output("approach", procedure_id, kind))
+        return desk.hand_out(case, Output("approach", procedure_id, kind))
 
     @router.get(
         "/api/v1/punctures/{event_id}/{kind}.dcm", response_class=FileResponse, responses=_DICOM
     )
-    def of_puncture(event_id: Id, kind: Literal["report", "presentation"]) -> FileResponse:
+    def of_puncture(
+        event_id: Id, kind: Literal["report", "presentation"], case: OfCase
+    ) -> FileResponse:
         """Measurement report or presentation state of a puncture, by the id of its event."""
-        return desk.hand_out(Output("puncture", event_id, kind))
+        return desk.hand_out(case, Output("puncture", event_id, kind))
 
     return router
 
@@ -149,15 +153,14 @@ def output_router(case_dir: Path) -> APIRouter:
 class _Desk:
     """Hands out outputs; those that were not made yet are made one at a time, elsewhere."""
 
-    def __init__(self, case_dir: Path) -> None:
-        self._case_dir = case_dir
+    def __init__(self) -> None:
         self._turn = threading.Lock()
 
-    def hand_out(self, output: Output) -> FileResponse:
-        path = output.path(self._case_dir)
+    def hand_out(self, case: AskedCase, output: Output) -> FileResponse:
+        path = output.path(case.folder)
         if not path.is_file():
-            self._check(output)
-            self._make(output)
+            self._check(case, output)
+            self._make(case, output)
         return FileResponse(
             path,
             media_type="application/dicom",
@@ -165,26 +168,26 @@ class _Desk:
             headers={"Cache-Control": "private, no-cache"},
         )
 
-    def _check(self, output: Output) -> None:
+    def _check(self, case: AskedCase, output: Output) -> None:
         """CaseRecordError or ImageMissingError (404) before a process is started for nothing."""
-        with CaseRecord(self._case_dir) as record:
+        with case.record() as record:
             found = _FIND[output.subject](record, output.number)
         if output.kind == "image" and not found.result.get("reconstruction"):
             raise ImageMissingError(f"measurement {output.number} has no reconstruction")
 
-    def _make(self, output: Output) -> None:
+    def _make(self, case: AskedCase, output: Output) -> None:
         if not self._turn.acquire(timeout=_TURN_S):
             text = "Other DICOM objects are being made: try again in a few seconds."
             raise ProblemError(429, "busy", text, {"Retry-After": "5"})
         try:
-            _made_elsewhere(self._case_dir, output)
+            _made_elsewhere(case, output)
         finally:
             self._turn.release()
 
 
-def _made_elsewhere(case_dir: Path, output: Output) -> None:
+def _made_elsewhere(case: AskedCase, output: Output) -> None:
     """highdicom takes its time to load."""
-    words = [sys.executable, "-m", "service.dicom_out.make", str(case_dir), output.name]
+    words = [sys.executable, "-m", "service.dicom_out.make", str(case.folder), output.name]
     failure = run_elsewhere(words, output.name, _PATIENCE_S)
     if failure is not None:
         raise ProblemError(409, "no_output", f"{output.name} cannot be made: {failure}")

@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
-from case_record.record import CaseRecord
 from case_record.rows import SliceRow
 from service.room.history import known_targets, past_cases, targets_over_time
 from service.room.summaries import CaseSummary, KnownTarget, MeasurementBody
+from service.web.of_case import OfCase, RoomCases
 from service.web.pagination import ERRORS, ERRORS_WITH_ID, After, Id, Limit, Newest, link_onward
 from service.web.schemas import EventBody, SliceBody
 
 
-def event_router(case_dir: Path) -> APIRouter:
+def event_router() -> APIRouter:
     """What happened, in this case and in those before it."""
     router = APIRouter(prefix="/api/v1", tags=["record"])
 
@@ -23,12 +22,13 @@ def event_router(case_dir: Path) -> APIRouter:
     def events(
         request: Request,
         response: Response,
+        case: OfCase,
         after: After = 0,
         limit: Limit = 200,
         newest: Newest = False,
     ) -> list[EventBody]:
         """Everything that happened; `Link: rel="next"` leads on."""
-        with CaseRecord(case_dir) as record:
+        with case.record() as record:
             found = (
                 record.newest_events(limit, after or None)
                 if newest
@@ -48,14 +48,14 @@ def event_router(case_dir: Path) -> APIRouter:
         ]
 
     @router.get("/cases", responses=ERRORS)
-    def cases() -> list[CaseSummary]:
-        """The case folders beside the present one, newest first."""
-        return past_cases(case_dir)
+    def cases(of_room: RoomCases) -> list[CaseSummary]:
+        """Every case of this room, newest first."""
+        return past_cases(of_room)
 
     return router
 
 
-def slice_router(case_dir: Path) -> APIRouter:
+def slice_router() -> APIRouter:
     """The slices that were received."""
     router = APIRouter(prefix="/api/v1", tags=["record"])
 
@@ -63,27 +63,28 @@ def slice_router(case_dir: Path) -> APIRouter:
     def slices(
         request: Request,
         response: Response,
+        case: OfCase,
         state: Annotated[str | None, Query(pattern="^(assigned|pending|quarantined)$")] = None,
         after: After = 0,
         limit: Limit = 100,
         newest: Newest = False,
     ) -> list[SliceBody]:
         """Every slice that was received, with what was decided about it and by whom."""
-        with CaseRecord(case_dir) as record:
+        with case.record() as record:
             rows = record.page_of_slices(after_id=after, limit=limit, newest=newest, state=state)
         link_onward(request, response, [row.slice_id for row in rows], limit)
         return [_slice_body(row) for row in rows]
 
     @router.get("/slices/{slice_id}", responses=ERRORS_WITH_ID)
-    def one_slice(slice_id: Id) -> SliceBody:
+    def one_slice(slice_id: Id, case: OfCase) -> SliceBody:
         """One slice."""
-        with CaseRecord(case_dir) as record:
+        with case.record() as record:
             return _slice_body(record.slice(slice_id))
 
     return router
 
 
-def measurement_router(case_dir: Path) -> APIRouter:
+def measurement_router() -> APIRouter:
     """What was measured, and how far that was from which target."""
     router = APIRouter(prefix="/api/v1", tags=["record"])
 
@@ -91,21 +92,22 @@ def measurement_router(case_dir: Path) -> APIRouter:
     def measurements(
         request: Request,
         response: Response,
+        case: OfCase,
         after: After = 0,
         limit: Limit = 100,
         newest: Newest = False,
     ) -> list[MeasurementBody]:
         """Every measurement, with its error to the target that was set at that time."""
-        with CaseRecord(case_dir) as record:
+        with case.record() as record:
             rows = record.page_of_measurements(after_id=after, limit=limit, newest=newest)
             targets = targets_over_time(record)
         link_onward(request, response, [row.measurement_id for row in rows], limit)
         return [targets.body_of(row) for row in rows]
 
     @router.get("/targets", responses=ERRORS)
-    def targets() -> list[KnownTarget]:
+    def targets(case: OfCase) -> list[KnownTarget]:
         """Every target of the case in the order in which they were set, with its approaches."""
-        with CaseRecord(case_dir) as record:
+        with case.record() as record:
             return known_targets(record)
 
     return router

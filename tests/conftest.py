@@ -1,0 +1,30 @@
+"""Which tests start processes: `make quick` leaves them out. Its folder is where every test finds
+`real_slices`."""
+
+import re
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+_HERE = Path(__file__).parent
+_FIXTURES = {"shared_room", "stages", "receiver", "start", "demo", "client", "browser", "page"}
+_STARTS = re.compile(r"^\s*(?:import|from) (?:subprocess|playwright|multiprocessing)\b", re.M)
+_IMPORTS = re.compile(r"^from (\w+) import|^import (\w+)$", re.M)
+
+
+@cache
+def _starts_processes(path: Path) -> bool:
+    """Whether a module of the tests starts processes, by itself or by a helper beside it."""
+    text = path.read_text()
+    if _STARTS.search(text):
+        return True
+    helpers = {path.with_name(f"{a or b}.py") for a, b in _IMPORTS.findall(text)} - {path}
+    return any(_starts_processes(helper) for helper in helpers if helper.is_file())
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    for item in items:
+        fixtures = set(getattr(item, "fixturenames", ()))
+        if fixtures & _FIXTURES or _starts_processes(item.path):
+            item.add_marker("process")

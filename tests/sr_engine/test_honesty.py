@@ -1,0 +1,74 @@
+"""The reported covariance against the scatter, for every point spread that is accepted."""
+
+import numpy as np
+import pytest
+
+from sr_engine.errors import EngineError, NoRoundObjectError, NotConvergedError
+from sr_engine.localize import localize
+from sr_engine.psf import Psf
+from sr_engine.simulate import filtered_noise, render_disc
+
+KINDS = ("flat", "hamming", "fermi", "elliptical")
+ACQUIRED = ((1.0, 1.0), (0.8, 0.8), (2 / 3, 2 / 3), (0.5, 0.5), (1.0, 0.5))
+BACKGROUNDS = (0.0, 0.3)
+EVERY = [(kind, a, b) for kind in KINDS for a in ACQUIRED for b in BACKGROUNDS]
+A_FEW = [
+    ("flat", (0.5, 0.5), 0.0),
+    ("hamming", (2 / 3, 2 / 3), 0.3),
+]
+
+
+def normalised_squares(psf: Psf, background: float, snr: float, trials: int) -> np.ndarray:
+    """(trials,) squared errors over the covariance that came with them; 2 on average."""
+    rng = np.random.default_rng(1)
+    out = []
+    radius = 4 / max(psf.acquired)
+    for _ in range(trials):
+        true = np.array((52.0, 60.0)) + rng.uniform(-4, 4, 2)
+        clean = render_disc((104, 120), tuple(true), radius, background=background, psf=psf)
+        channels = [filtered_noise(clean.shape, 1 / snr, psf, rng) for _ in range(2)]
+        found = localize(
+            np.hypot(clean + channels[0], channels[1]),
+            start_px=true + rng.normal(0, 0.4, 2),
+            radius_px=(0.6 * radius, 1.6 * radius),
+            psf=psf,
+        )
+        error = found.centre_px - true
+        out.append(error @ np.linalg.solve(found.covariance_px2, error))
+    return np.array(out)
+
+
+@pytest.mark.parametrize(("kind", "acquired", "background"), A_FEW)
+def test_covariance_is_what_the_scatter_is(
+    kind: str, acquired: tuple[float, float], background: float
+) -> None:
+    squares = normalised_squares(Psf(kind, acquired=acquired), background, 60, 24)
+    assert 0.9 < squares.mean() < 3.6
+
+
+@pytest.mark.soak
+@pytest.mark.timeout(3600)
+@pytest.mark.parametrize("snr", [20, 60])
+@pytest.mark.parametrize(("kind", "acquired", "background"), EVERY)
+def test_covariance_is_what_the_scatter_is_everywhere(
+    kind: str, acquired: tuple[float, float], background: float, snr: float
+) -> None:
+    squares = normalised_squares(Psf(kind, acquired=acquired), background, snr, 300)
+    assert 1.6 < squares.mean() < 2.45
+
+
+def test_a_ring_never_ends_in_anything_but_an_answer_or_a_refusal() -> None:
+    """The disc fit of a ring can slide to an object without contrast: refused, not crashed."""
+    rng = np.random.default_rng(4)
+    outcomes = []
+    for _ in range(60):
+        centre = tuple(np.array((50.0, 62.0)) + rng.uniform(-3, 3, 2))
+        clean = render_disc((100, 124), centre, 5.0) - render_disc((100, 124), centre, 3.3)
+        frame = np.hypot(clean + rng.normal(0, 0.05, clean.shape), rng.normal(0, 0.05, clean.shape))
+        try:
+            found = localize(frame, start_px=centre, radius_px=(2.5, 6.5))
+        except EngineError as error:
+            outcomes.append(type(error))
+        else:
+            assert np.all(np.linalg.eigvalsh(found.covariance_px2) > 0)
+    assert set(outcomes) <= {NoRoundObjectError, NotConvergedError}
