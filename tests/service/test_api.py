@@ -45,16 +45,11 @@ def test_a_jog_out_of_travel_is_refused_with_axis_and_limits(
     client: RoomClient, state: RoomState
 ) -> None:
     end_um = max(state.robot.travel_um["yt"])
-    client.jog("yt", 5000)
-    wait_for(client.state, lambda s: s.procedure is None and not s.robot.moving)
-    for _ in range(4):
-        now = wait_for(client.state, lambda s: s.procedure is None and not s.robot.moving)
-        if now.robot.positions_um["yt"] + 5000 > end_um:
-            break
-        client.jog("yt", 5000)
     now = wait_for(client.state, lambda s: s.procedure is None and not s.robot.moving)
     with pytest.raises(RefusedByServiceError, match=r"axis yt.*outside its travel") as refused:
-        client.jog("yt", 5000)
+        while now.robot.positions_um["yt"] <= end_um:
+            client.jog("yt", 5000)
+            now = wait_for(client.state, lambda s: s.procedure is None and not s.robot.moving)
     assert (refused.value.status, refused.value.code) == (409, "out_of_travel")
     assert client.state().robot.positions_um == now.robot.positions_um
     with pytest.raises(RefusedByServiceError, match="no axis"):
