@@ -12,11 +12,12 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import structlog
 
+from case_record.attempts import MOST_DEATHS, Attempts
 from case_record.cases import Cases
 from case_record.presence import Presence, Sole
 from case_record.record import CaseRecord, CaseRecordError
 from dicom_listener.assign import AssignRules
-from dicom_listener.clock import ClockRules, Sync
+from dicom_listener.clock import ClockRules, Comparison, Promptness
 from dicom_listener.holding_area import INBOX
 from dicom_listener.inbox import Inbox
 from dicom_listener.intake import IntakeRules
@@ -46,6 +47,10 @@ class Ready:
     ae_title: str
 
 
+class ListeningEndedError(RuntimeError):
+    """Nothing is received any more: the process ends, so that it is started again."""
+
+
 class PortError(ConfigError):
     """The port cannot be bound: most often another process has it."""
 
@@ -71,11 +76,8 @@ def scp_rules(config: ListenerConfig) -> ScpRules:
     )
 
 
-def intake_rules(config: Config, now_s: float) -> IntakeRules:
+def intake_rules(config: Config) -> IntakeRules:
     listener = config.listener
-    sync = None
-    if listener.clock_offset_s is not None:
-        sync = Sync(listener.clock_offset_s, listener.clock_uncertainty_s, now_s)
     return IntakeRules(
         slices=SliceRules(
             coronal_tolerance_deg=config.imaging.coronal_tolerance_deg,
@@ -88,13 +90,30 @@ def intake_rules(config: Config, now_s: float) -> IntakeRules:
             arrival_mode=listener.arrival_mode,
         ),
         clock=ClockRules(
-            prompt_delay_s=listener.prompt_delay_s,
+            promptness=_promptness(listener),
             longest_acquisition_s=listener.longest_acquisition_s,
-            largest_offset_s=listener.largest_clock_offset_s,
             late_limit_s=listener.late_limit_s,
+            comparison_valid_s=60 * listener.comparison_valid_min,
         ),
         zone=_zone(listener.scanner_time_zone),
-        sync=sync,
+        comparison=_comparison(listener),
+    )
+
+
+def _promptness(listener: ListenerConfig) -> Promptness | None:
+    if listener.prompt_delay_s is None:
+        return None
+    return Promptness(listener.least_delay_s, listener.prompt_delay_s)
+
+
+def _comparison(listener: ListenerConfig) -> Comparison | None:
+    """As the room's file states it, made when the file says (`load_config` sees to that)."""
+    if listener.clock_offset_s is None or listener.clock_compared_at is None:
+        return None
+    return Comparison(
+        listener.clock_offset_s,
+        listener.clock_uncertainty_s,
+        listener.clock_compared_at.timestamp(),
     )
 
 
@@ -142,7 +161,7 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             inbox_folder(cases.home),
             min_free_bytes=config.listener.min_free_mib * _MIB,
         )
-        rules = intake_rules(config, time.time())
+        rules = intake_rules(config)
         scp = open_scp(config.listener, inbox, metrics, received.put)
         stack.callback(scp.stop)
         discarded = inbox.discard_unfinished()
@@ -166,7 +185,8 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         presence = stack.enter_context(Presence(cases.home, "listener"))
         retention_s = config.listener.retention_days * 86400
         tending = Tending(inbox, reception, retention_s)
-        _loop(reception, scp, tending, received, stop, presence)
+        attempts = stack.enter_context(Attempts(cases.home, "listener"))
+        _loop(reception, scp, tending, received, stop, presence, attempts)
 
 
 def _loop(
@@ -176,13 +196,16 @@ def _loop(
     received: "SimpleQueue[Path]",
     stop: threading.Event,
     presence: Presence,
+    attempts: Attempts,
 ) -> None:
     while not stop.is_set():
         presence.beat()
+        if not scp.is_listening:
+            raise ListeningEndedError("the thread that listens on the port has ended")
         try:
             if reception.follow():
                 _requeue(reception, received)
-            _take_received(reception, received)
+            _take_received(reception, received, attempts)
             reception.turn()
             while scp.alarms:
                 reception.note_alarm(*scp.alarms.popleft())
@@ -192,6 +215,9 @@ def _loop(
             log.error("the case record cannot be written", error=str(error))
             stop.wait(_RECORD_RETRY_S)
             _requeue(reception, received)
+        except Exception:  # receiving and storing go on, whatever the rest of the loop meets
+            log.exception("the listener's loop")
+            stop.wait(_RECORD_RETRY_S)
 
 
 class Tending:
@@ -230,12 +256,23 @@ def _requeue(reception: Reception, received: "SimpleQueue[Path]") -> int:
     return len(left_over)
 
 
-def _take_received(reception: Reception, received: "SimpleQueue[Path]") -> None:
+def _take_received(reception: Reception, received: "SimpleQueue[Path]", attempts: Attempts) -> None:
     """Wait for at most one poll, then take whatever is there."""
     try:
         path = received.get(timeout=_POLL_S)
         while True:
-            reception.take(path)
+            _take(reception, path, attempts)
             path = received.get_nowait()
     except Empty:
         return
+
+
+def _take(reception: Reception, path: Path, attempts: Attempts) -> None:
+    """One file; one over which the listener was killed again and again is not read any more."""
+    deaths = attempts.deaths(path.name)
+    if deaths >= MOST_DEATHS:
+        reception.set_aside(path, f"the listener ended {deaths} times while it read this file")
+        attempts.forget(path.name)
+        return
+    with attempts.at(path.name):
+        reception.take(path)

@@ -17,6 +17,8 @@ from dicom_listener.holding_area import INBOX, NO_CASE, Arrival, HoldingArea
 from dicom_listener.inbox import Inbox, NotFromInboxError, read_envelope
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
+from dicom_slice.patient import Identity
+from dicom_slice.reasons import Reason, SetAside
 
 _AGAIN_S = 1.0
 _LEFT_OVER_CASES = 3
@@ -123,6 +125,16 @@ class Reception:
             log.warning("foreign_file", text=str(error))
             return
         self._area.keep(Arrival.of_file(path, envelope), NO_CASE)
+
+    def set_aside(self, path: Path, text: str) -> None:
+        """As `take`, of a file that is not to be read: nobody can say whose it is."""
+        if self._area is None:
+            if self.intake is not None:
+                self.intake.set_aside(path, text)
+        elif path.exists():
+            why = SetAside(Reason.UNREADABLE, text)
+            self._area.keep(Arrival(path, read_envelope(path)[0], Identity()), why)
+            self.alarm("intake_failed", f"{path.name}: {text}")
 
     def turn(self) -> None:
         """Follow what other processes wrote, and take what turned out to be this case's own."""
