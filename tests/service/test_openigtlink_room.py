@@ -339,3 +339,28 @@ def test_every_message_in_every_phase_changes_nothing_without_the_operator(room,
         by_peers = {e.kind for e in record.events() if e.who.startswith("OpenIGTLink")}
     allowed = {"plan_proposed", "proposal_turned_away", "registration_received", "stop"}
     assert by_peers <= allowed
+
+
+def test_pyigtl_plans_and_stops(room, port):
+    """It keeps the last message of a device, and drops every STATUS."""
+    pyigtl = pytest.importorskip("pyigtl", reason="pyigtl is not installed")
+    with RoomClient(room.url, by="Olga") as client:
+        calibrated(client)
+        target = beside(client.state(), 2.5)
+        planning = pyigtl.OpenIGTLinkClient("127.0.0.1", port)
+        try:
+            matrix = np.eye(4)
+            matrix[:3, 3] = np.array(target) * TO_RAS
+            planning.send_message(pyigtl.TransformMessage(matrix, device_name="TGT_5"))
+            acknowledged = planning.wait_for_message("ACK_5", timeout=60)
+            assert np.allclose(acknowledged.matrix, matrix, atol=1e-4)
+            assert planning.wait_for_message("REACHABLE_TARGET", timeout=60) is not None
+            (one,) = [p for p in client.state().proposals if p.state == "open"]
+            client.take_proposal(one.number, in_water=False)
+            assert client.state().target_patient_mm == pytest.approx(target, abs=1e-3)
+            planning.send_message(pyigtl.StringMessage("STOP", device_name="CMD_6"))
+            assert planning.wait_for_message("ACK_6", timeout=60).string == "STOP"
+            wait_for(client.state, lambda s: s.robot.stopped)
+        finally:
+            planning.stop()
+        stop_all(client)
