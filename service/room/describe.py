@@ -27,11 +27,11 @@ from service.room.motion_allowed import may_start
 from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
 from service.room.prompt import is_calibrated, outcome_text, prompt
 from service.room.proposals import ProposalBook
+from service.room.scanner_clock import clock_update
 from service.room.state import (
     AcquisitionState,
     ArrivalState,
     CaseState,
-    ClockState,
     FiducialState,
     HoldState,
     LostState,
@@ -97,7 +97,7 @@ class Describer:
                 **_slices(record),
                 "measurement": _measurement(record, measurement, now),
                 **self._around(measurement, before),
-                "clock": _clock(config, record),
+                **clock_update(config, record, time.time()),
                 "calibrated": is_calibrated(config, record),
                 "target_patient_mm": tuple(target_mm) if target_mm else None,
                 "entry_patient_mm": current_entry(record),
@@ -286,22 +286,3 @@ def _timeless(state: RoomState) -> RoomState:
 def _punctured(record: CaseRecord, procedure_id: int) -> bool:
     puncture = record.last_event("puncture")
     return puncture is not None and puncture.body["procedure_id"] == procedure_id
-
-
-def _clock(config: Config, record: CaseRecord) -> ClockState | None:
-    compared = record.last_event("clock_sync")
-    forgotten = record.last_event("clock_reset")
-    listener = config.listener
-    if forgotten is not None and (compared is None or compared.event_id < forgotten.event_id):
-        return None
-    if compared is not None:
-        offset_s, uncertainty_s = (compared.body[k] for k in ("offset_s", "uncertainty_s"))
-        return ClockState(
-            offset_s=offset_s,
-            uncertainty_s=uncertainty_s,
-            compared_s=compared.wall_s,
-            who=compared.who,
-        )
-    if listener.clock_offset_s is None:
-        return None
-    return ClockState(offset_s=listener.clock_offset_s, uncertainty_s=listener.clock_uncertainty_s)
