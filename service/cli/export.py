@@ -54,7 +54,7 @@ def export(
     target = out or Path(f"{case.resolve().name}.zip")
     if target.exists() and not force:
         raise ExportError(f"{target} is there already (--force replaces it)")
-    with CaseRecord(case) as record:
+    with CaseRecord(case, read_only=True) as record:
         members = write_export(record, target)
     print(f"{target}: {members} files")
 

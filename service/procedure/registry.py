@@ -18,6 +18,7 @@ from service.procedure.jog import JogEnd, jog
 from service.procedure.recording import Place, RecordingArguments, record_place
 from service.procedure.sensing import ValidationGate
 from service.procedure.steps import ProcedureSteps
+from service.procedure.validity import calibration_good_since
 
 CALIBRATION = "calibration"
 APPROACH = "approach"
@@ -92,10 +93,14 @@ def result_to_json(
 def latest_calibration(record: CaseRecord, *, guide: bool = False) -> Calibration | None:
     """What the last procedure that came to its end knew; a later calibration replaces it.
 
+    None where there is none, or none that is good any more.
+
     guide: of both fiducials and four axes, else of one and two.
     """
     calibration = record.last_procedure(GUIDE_CALIBRATION if guide else CALIBRATION, "done")
     if calibration is None or calibration.result is None:
+        return None
+    if calibration.begun_seq <= calibration_good_since(record):
         return None
     newest = calibration
     for name in (GUIDE_APPROACH, GUIDE_RECORDING) if guide else (APPROACH, RECORDING):

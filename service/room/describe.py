@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
-from case_record.cases import Cases
 from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
 from room_config.load import Config
 from service.procedure.targets import current_entry, current_target
 from service.room.alarms import AlarmBook, Condition
+from service.room.case_life import QUESTION, CaseLife
 from service.room.conditions import HANGS, conditions
 from service.room.context import now_of
 from service.room.describe_measurement import (
@@ -22,6 +23,7 @@ from service.room.describe_measurement import (
     describe_reconstruction,
 )
 from service.room.execution import Execution
+from service.room.held_slices import HeldSlices, arriving
 from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
 from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
@@ -57,17 +59,18 @@ class Describer:
         config: Config,
         record: CaseRecord,
         link: RoomLink,
+        life: CaseLife,
         others_wrong: Callable[[], Sequence[Condition]] = tuple,
     ) -> None:
         self._others_wrong = others_wrong
         self._config = config
-        self._home = Cases(*config.room.folders).home
+        self._life = life
+        self._held = HeldSlices(life.cases)
+        self._look = ProcessLook(life.cases.home)
         self._record = record
         self._link = link
         self._alarms = AlarmBook()
         self._proposals = ProposalBook()
-        self._processes: list[ProcessState] = []
-        self._look_at_s = 0.0
         self._around_id = 0
 
     def describe(self, execution: Execution, before: RoomState) -> RoomState:
@@ -84,9 +87,14 @@ class Describer:
             update={
                 "at_s": time.time(),
                 "case_uid": case.case_uid if case else "",
+                "case_folder": record.case_dir.name,
+                "case_question": QUESTION if self._life.asks else "",
+                "holding": self._held.look(record),
                 "case": _case(record),
                 **_procedures(record, execution),
-                "prompt": prompt(config, record, link, execution, found),
+                "prompt": QUESTION
+                if self._life.asks
+                else prompt(config, record, link, execution, found),
                 "ready": arrival is not None,
                 "ready_lost": _lost_ready(found),
                 "arrival": arrival,
@@ -103,13 +111,14 @@ class Describer:
                 "entry_patient_mm": current_entry(record),
                 **_error(config, record, target_mm, now),
                 "event_id": record.last_event_id(),
-                "processes": self._look_at_processes(),
+                "processes": self._look.processes(),
                 "proposals": self._proposals.update(record),
             }
         )
         other = _other(record, state.other_fiducial, now)
         state = state.model_copy(update={"other_fiducial": other})
-        alarms = self._alarms.update([*conditions(state), *self._others_wrong()], record)
+        wrong = [*conditions(state), *arriving(record), *self._others_wrong()]
+        alarms = self._alarms.update(wrong, record)
         state = state.model_copy(update={"alarms": alarms})
         same = _timeless(state) == _timeless(before)
         return state.model_copy(update={"revision": before.revision + (not same)})
@@ -124,7 +133,16 @@ class Describer:
             "other_fiducial": describe_other_fiducial(self._record, last),
         }
 
-    def _look_at_processes(self) -> list[ProcessState]:
+
+class ProcessLook:
+    """How the other processes of the room do; looked at now and then."""
+
+    def __init__(self, home: Path) -> None:
+        self._home = home
+        self._processes: list[ProcessState] = []
+        self._look_at_s = 0.0
+
+    def processes(self) -> list[ProcessState]:
         if time.monotonic() >= self._look_at_s:
             self._look_at_s = time.monotonic() + _LOOK_EVERY_S
             self._processes = [
@@ -136,7 +154,7 @@ class Describer:
 
 def _condition(seen: bool, running: bool, beat_age_s: float) -> dict[str, str]:
     if not seen:
-        return {"condition": "none", "detail": "has not run on this case yet"}
+        return {"condition": "none", "detail": "has not run in this room yet"}
     if not running:
         return {"condition": "down", "detail": "has ended"}
     if beat_age_s > _BEAT_IS_LOST_S:

@@ -8,7 +8,7 @@ from case_record.record import CaseRecord
 from robot_bridge.client.client import BridgeStatus
 from robot_bridge.protocol.phases import WorkPhase
 from room_config.load import Config
-from service.procedure.registry import CALIBRATION, GUIDE_CALIBRATION
+from service.procedure.registry import latest_calibration
 from service.procedure.targets import current_entry, current_target
 from service.room.execution import Execution
 from service.room.link import RoomLink
@@ -60,8 +60,7 @@ def _after_arrival(found: Readiness, status: BridgeStatus) -> str:
 
 def is_calibrated(config: Config, record: CaseRecord) -> bool:
     """As the room is used: with the guide's four axes if it has them."""
-    name = CALIBRATION if config.service.guide is None else GUIDE_CALIBRATION
-    return record.last_procedure(name, "done") is not None
+    return latest_calibration(record, guide=config.service.guide is not None) is not None
 
 
 def plain_words(code: str) -> str:

@@ -179,6 +179,22 @@ class CaseState(_Frozen):
     note: str = ""
 
 
+class HeldState(_Frozen):
+    """Slices of one study that wait in the holding area; of another patient's no more than that.
+
+    study: empty where it is not to be shown, or not known. code, reason: of the newest one.
+    """
+
+    study: str = ""
+    code: str
+    reason: str
+    description: str = ""
+    slices: int
+    first_received_s: float
+    last_received_s: float
+    may_be_taken: bool = False
+
+
 class ProcessState(_Frozen):
     """One of the room's processes: `up`, `old` (hangs or is quiet), `down`, `none` (not seen)."""
 
@@ -205,6 +221,10 @@ class RoomState(_Frozen):
     room: str
     virtual: bool
     case_uid: str = ""
+    case_folder: str | None = None
+    cases_begin_here: bool = False
+    case_question: str = ""
+    holding: list[HeldState] = []
     procedure: str | None = None
     procedure_id: int | None = None
     last_outcome: str = ""
@@ -250,6 +270,7 @@ class RoomState(_Frozen):
             at_s=time.time(),
             service_id=uuid.uuid4().hex,
             room=config.room.name,
+            cases_begin_here=config.room.cases_dir is not None,
             virtual=config.room.virtual,
             arrival_mode=config.listener.arrival_mode,
             guide=config.service.guide is not None,

@@ -103,6 +103,26 @@ class CaseBody(Ask):
     note: str = Field(default="", max_length=2000)
 
 
+class CaseBegun(BaseModel):
+    """The name of the case's folder."""
+
+    folder: str
+
+
+class FinishBody(Ask):
+    park: bool = Field(default=False, description="True: take the power off the drives, too.")
+
+
+class StudyBody(Ask):
+    study: str = Field(
+        min_length=1,
+        max_length=64,
+        pattern=r"^[0-9.]+$",
+        description="StudyInstanceUID of slices that /api/v1/holding lists.",
+        examples=["1.2.826.0.1.3680043.8.498.1"],
+    )
+
+
 class ClockBody(Ask):
     """A comparison of the two clocks, made now: the room's minus the scanner's."""
 
