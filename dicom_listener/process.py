@@ -17,7 +17,7 @@ from case_record.cases import Cases
 from case_record.presence import Presence, Sole
 from case_record.record import CaseRecord
 from dicom_listener.assign import AssignRules
-from dicom_listener.clock import ClockRules, Sync
+from dicom_listener.clock import ClockRules, Comparison, Promptness
 from dicom_listener.inbox import Inbox
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
@@ -74,11 +74,8 @@ def scp_rules(config: ListenerConfig) -> ScpRules:
     )
 
 
-def intake_rules(config: Config, now_s: float) -> IntakeRules:
+def intake_rules(config: Config) -> IntakeRules:
     listener = config.listener
-    sync = None
-    if listener.clock_offset_s is not None:
-        sync = Sync(listener.clock_offset_s, listener.clock_uncertainty_s, now_s)
     return IntakeRules(
         slices=SliceRules(
             coronal_tolerance_deg=config.imaging.coronal_tolerance_deg,
@@ -91,13 +88,30 @@ def intake_rules(config: Config, now_s: float) -> IntakeRules:
             arrival_mode=listener.arrival_mode,
         ),
         clock=ClockRules(
-            prompt_delay_s=listener.prompt_delay_s,
+            promptness=_promptness(listener),
             longest_acquisition_s=listener.longest_acquisition_s,
-            largest_offset_s=listener.largest_clock_offset_s,
             late_limit_s=listener.late_limit_s,
+            comparison_valid_s=60 * listener.comparison_valid_min,
         ),
         zone=_zone(listener.scanner_time_zone),
-        sync=sync,
+        comparison=_comparison(listener),
+    )
+
+
+def _promptness(listener: ListenerConfig) -> Promptness | None:
+    if listener.prompt_delay_s is None:
+        return None
+    return Promptness(listener.least_delay_s, listener.prompt_delay_s)
+
+
+def _comparison(listener: ListenerConfig) -> Comparison | None:
+    """As the room's file states it, made when the file says (`load_config` sees to that)."""
+    if listener.clock_offset_s is None or listener.clock_compared_at is None:
+        return None
+    return Comparison(
+        listener.clock_offset_s,
+        listener.clock_uncertainty_s,
+        listener.clock_compared_at.timestamp(),
     )
 
 
@@ -144,7 +158,7 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             inbox_folder(case_dir),
             min_free_bytes=config.listener.min_free_mib * _MIB,
         )
-        rules = intake_rules(config, time.time())
+        rules = intake_rules(config)
         scp = open_scp(config.listener, inbox, metrics, received.put)
         stack.callback(scp.stop)
         discarded = inbox.discard_unfinished()
