@@ -13,7 +13,7 @@ from pathlib import Path
 
 import httpx
 import numpy as np
-from attended_room import AttendedRoom, arm, calibrated, wait_for
+from attended_room import AttendedRoom, arm, calibrated, running_room, wait_for
 from lone_service import running_service
 from PIL import Image
 from test_supervisor import wait_until
@@ -111,8 +111,13 @@ asyncio.run(main())
 """
 
 
-def test_stop_gets_through_whatever_viewers_ask_for(room: AttendedRoom, client: RoomClient) -> None:
-    calibrated(client)
+def test_stop_gets_through_whatever_viewers_ask_for(tmp_path: Path) -> None:
+    with running_room(tmp_path) as room, RoomClient(room.url, by="tester") as client:
+        calibrated(client)
+        _stop_under_load(room, client)
+
+
+def _stop_under_load(room: AttendedRoom, client: RoomClient) -> None:
     viewers = subprocess.Popen([sys.executable, "-c", VIEWERS, room.url])
     silent = [socket.create_connection(address_of(room.url)) for _ in range(200)]
     try:
