@@ -32,6 +32,7 @@ from service.room.state import (
     AcquisitionState,
     ArrivalState,
     CaseState,
+    FiducialState,
     HoldState,
     LostState,
     MeasurementState,
@@ -106,6 +107,8 @@ class Describer:
                 "proposals": self._proposals.update(record),
             }
         )
+        other = _other(record, state.other_fiducial, now)
+        state = state.model_copy(update={"other_fiducial": other})
         alarms = self._alarms.update([*conditions(state), *self._others_wrong()], record)
         state = state.model_copy(update={"alarms": alarms})
         same = _timeless(state) == _timeless(before)
@@ -245,6 +248,15 @@ def _measurement(record: CaseRecord, last: Measurement | None, now: Now) -> Meas
         "age_s": None if facts is None else age_s(facts, now),
     }
     return describe_measurement(last).model_copy(update=update)
+
+
+def _other(record: CaseRecord, other: FiducialState | None, now: Now) -> FiducialState | None:
+    """The other fiducial, and whether it is still there."""
+    if other is None:
+        return None
+    lost = why_not_now(record, record.measurement(other.measurement_id), now)
+    said = None if lost is None else LostState(code=lost.code, text=lost.text)
+    return other.model_copy(update={"lost": said})
 
 
 def _error(

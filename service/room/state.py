@@ -88,6 +88,7 @@ class FiducialState(_Frozen):
     measurement_id: int
     patient_mm: tuple[float, float, float]
     radius_mm: float
+    lost: LostState | None = None
 
 
 class ClockState(_Frozen):
