@@ -22,7 +22,6 @@ from pynetdicom.association import Association
 from pynetdicom.events import Event
 
 from dicom_listener import inbox as inbox_module
-from dicom_listener.endings import ending_of
 from dicom_listener.inbox import Envelope, Inbox, InboxError, sha256_of
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.negotiation import (
@@ -33,7 +32,8 @@ from dicom_listener.negotiation import (
     rejection_text,
     report_of,
 )
-from dicom_listener.store_request import mend_store_request, uid_sent_under
+from dicom_listener.network.endings import ending_of
+from dicom_listener.network.store_request import mend_store_request, uid_sent_under
 from dicom_listener.transport import BoundedSocket, PromptServer
 from dicom_slice.peek import NoDataSetError, peek
 from room_config.networks import address_of

@@ -24,8 +24,8 @@ from pynetdicom.pdu import A_ABORT_RQ
 from pynetdicom.timer import Timer
 from pynetdicom.transport import AssociationSocket, RequestHandler, ThreadedAssociationServer
 
-from dicom_listener.association_request import ASSOCIATE_RQ, mended_request
 from dicom_listener.lobby import Lobby, NoRequestError, await_request
+from dicom_listener.network.association_request import ASSOCIATE_RQ, mended_request
 
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)
 _CHUNK_BYTES = 256 * 1024

@@ -22,8 +22,8 @@ from raw_pdus import (
 )
 from test_scp import Serving, serving
 
-from dicom_listener.association_request import MalformedRequestError, mended_request
 from dicom_listener.negotiation import is_storage
+from dicom_listener.network.association_request import MalformedRequestError, mended_request
 
 ACCEPTED, ABORTED, DATA = 2, 7, 4
 pytestmark = pytest.mark.filterwarnings("ignore:.*UI.*:UserWarning")
