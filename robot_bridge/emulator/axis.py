@@ -22,6 +22,9 @@ MAX_SPEED_HZ = {"PMD401": 1500, "PMD301": 2500}
 # Capacitance x frequency that the output stage can drive, from the examples in the manuals.
 DERATING_NF_HZ = {"PMD401": 944_000, "PMD301": 3_501_000}
 SCRIPT_STEPS = 16
+OUTPUTS_HIGH = {"PMD401": 0b111, "PMD301": 0b011}  # they are inputs, pulled up, until they are set
+INDEXED = 1  # the position was reset at the index
+INDEX_SEARCHES = (STOP_AT_INDEX, RESET_AT_INDEX) = (2, 4)
 
 
 @dataclass(frozen=True)
@@ -87,10 +90,11 @@ class EmulatedController:
         self.target_limit = False
         self.external_limit_at_ms: int | None = None
         self.index_mode, self.index_position, self.index_unreported = 0, 0, False
+        self.index_found = False
         self.default_speed_hz = 1000
         self.last_target = 0
         self.stored: str | None = None
-        self.outputs = 0
+        self.outputs = OUTPUTS_HIGH[self.motor.model]
         self.script_outcome = 0
         self.log: PositionLog | None = None
         self.log_armed_s: float | None = None
@@ -188,6 +192,10 @@ class EmulatedController:
 
     @property
     def moving(self) -> bool:
+        return not self.parked and self._run_turns
+
+    @property
+    def _run_turns(self) -> bool:
         return isinstance(self.run, OpenRun) or (
             isinstance(self.run, TargetRun) and not self.run.idle
         )
@@ -313,7 +321,8 @@ class EmulatedController:
         self._look_for_index(raw - change, raw, before)
 
     def _look_for_index(self, raw_before: int, raw: int, count_before: int) -> None:
-        if self.motor.index_um is None or self.index_mode not in (2, 4) or raw == raw_before:
+        searching = self.index_mode in INDEX_SEARCHES and not self.index_found
+        if self.motor.index_um is None or not searching or raw == raw_before:
             return
         mark = round(self.motor.index_um / self.motor.um_per_count)
         if not min(raw_before, raw) <= mark <= max(raw_before, raw):
@@ -321,9 +330,10 @@ class EmulatedController:
         self.latched |= Status.INDEX
         self.index_position, self.index_unreported = self.count, True
         self.run = None
-        if self.index_mode == 4:
+        self.index_found = True
+        if self.index_mode == RESET_AT_INDEX:
             self.count = self.settings[y.INDEX_OFFSET]
-        self.index_mode = 1
+            self.index_mode = INDEXED
 
     # Status
 
