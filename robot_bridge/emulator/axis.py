@@ -312,19 +312,21 @@ class EmulatedController:
 
     def _follow_encoder(self) -> None:
         raw = self._encoder_raw()
-        change, self._raw_count = raw - self._raw_count, raw
+        raw_before, self._raw_count = self._raw_count, raw
+        change = raw - raw_before
         if self.settings[y.ENCODER_TYPE] == y.HOST_ENCODER or self.faults.encoder_frozen:
             return
         if self.settings[y.ENCODER_DIRECTION]:
             change = -change
-        before, self.count = self.count, self.count + change
-        self._look_for_index(raw - change, raw, before)
+        self.count += change
+        self._look_for_index(raw_before, raw)
 
-    def _look_for_index(self, raw_before: int, raw: int, count_before: int) -> None:
+    def _look_for_index(self, raw_before: int, raw: int) -> None:
         searching = self.index_mode in INDEX_SEARCHES and not self.index_found
         if self.motor.index_um is None or not searching or raw == raw_before:
             return
-        mark = round(self.motor.index_um / self.motor.um_per_count)
+        sign = -1 if self.motor.encoder_reversed else 1
+        mark = sign * round(self.motor.index_um / self.motor.um_per_count)
         if not min(raw_before, raw) <= mark <= max(raw_before, raw):
             return
         self.latched |= Status.INDEX

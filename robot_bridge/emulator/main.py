@@ -53,6 +53,9 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("--tcp-port", type=int, help="serve on 127.0.0.1 instead (0: any)")
     serve.add_argument("--control-port", type=int, default=0, help="on 127.0.0.1 (0: any)")
     serve.add_argument("--um-per-count", type=float, default=0.1, help="of the encoders")
+    serve.add_argument(
+        "--encoder-reversed", action="store_true", help="it counts down as the motor runs forward"
+    )
     serve.add_argument("--index-mm", type=float, help="where the encoders have their index")
     serve.add_argument("--travel-mm", type=float, default=60.0, help="between the hard stops")
     serve.add_argument("--switches", action="store_true", help="limit switches 1 mm inside them")
@@ -87,6 +90,7 @@ def _bus_from(args: argparse.Namespace) -> EmulatedBus:
             serial_number=args.serial_number + number,
             firmware="V13" if args.model == "PMD401" else "V20",
             um_per_count=args.um_per_count,
+            encoder_reversed=args.encoder_reversed,
             index_um=None if args.index_mm is None else args.index_mm * 1000,
             switches_um=(-pressed_um, pressed_um) if args.switches else None,
         )

@@ -171,7 +171,7 @@ REBOOTS = re.compile(r"Y41$")
 @settings(max_examples=400, deadline=None)
 @given(st.lists(BODY, min_size=1, max_size=6))
 def test_every_line_is_answered_by_its_echo_a_value_a_refusal_or_not_at_all(bodies: list[str]):
-    """Manual 4.2. Address and body come back as they were sent; `;` and address 127 are silent; what
+    """Manual 4.2. Address and body come back as sent; `;` and address 127 are silent; what
     is not understood is `_??_`, what cannot be done ends in `!`; a parked motor never moves.
     """
     bench = Bench((1, 7))
