@@ -136,6 +136,10 @@ class EmulatedController:
         return not (self.parked or self._power_change or self.powerless)
 
     @property
+    def unparking(self) -> bool:
+        return bool(self._power_change and not self._power_change[1] and not self.powerless)
+
+    @property
     def powerless(self) -> bool:
         return self.faults.overheat or self.faults.supply_lost
 
@@ -192,7 +196,7 @@ class EmulatedController:
 
     @property
     def moving(self) -> bool:
-        return not self.parked and self._run_turns
+        return self._run_turns and not (self.parked and not self.unparking)
 
     @property
     def _run_turns(self) -> bool:
@@ -330,11 +334,12 @@ class EmulatedController:
         if not min(raw_before, raw) <= mark <= max(raw_before, raw):
             return
         self.latched |= Status.INDEX
-        self.index_position, self.index_unreported = self.count, True
+        beyond = mark - raw if self.settings[y.ENCODER_DIRECTION] else raw - mark
+        self.index_position, self.index_unreported = self.count - beyond, True
         self.run = None
         self.index_found = True
         if self.index_mode == RESET_AT_INDEX:
-            self.count = self.settings[y.INDEX_OFFSET]
+            self.count = self.settings[y.INDEX_OFFSET] + beyond
             self.index_mode = INDEXED
 
     # Status

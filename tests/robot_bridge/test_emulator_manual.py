@@ -57,8 +57,8 @@ def test_the_index_stops_and_does_not_reset_in_mode_2():  # 4.5
         bench,
         (b"X1N2\r", b"X1N2\r"),
         (b"X1I100,0,400\r", b"X1I100,0,400\r", 1.0),
-        (b"X1N\r", b"X1N:2,504.\r"),
-        (b"X1N?\r", b"X1N?:2,504, stopI\r"),
+        (b"X1N\r", b"X1N:2,500.\r"),
+        (b"X1N?\r", b"X1N?:2,500, stopI\r"),
         (b"X1E\r", b"X1E:504\r"),
         (b"X1I10\r", b"X1I10!\r"),  # only while not found yet
         (b"X1N2\r", b"X1N2\r"),
@@ -73,13 +73,13 @@ def test_the_index_resets_the_position_in_mode_4_and_y14_moves_it_afterwards(): 
         (b"X1N4\r", b"X1N4\r"),
         (b"X1I100,0,400\r", b"X1I100,0,400\r", 1.0),
         (b"X1U0\r", b"X1U0:0900\r"),
-        (b"X1N?\r", b"X1N?:1,504., indexed\r"),
-        (b"X1E\r", b"X1E:0\r"),
+        (b"X1N?\r", b"X1N?:1,500., indexed\r"),
+        (b"X1E\r", b"X1E:4\r"),  # what it went on before it stood
         (b"X1Y14,1000\r", b"X1Y14,1000\r"),
-        (b"X1E\r", b"X1E:1000\r"),
+        (b"X1E\r", b"X1E:1004\r"),
         (b"X1E500\r", b"X1E500\r"),
         (b"X1Y14\r", b"X1Y14:0\r"),
-        (b"X1N\r", b"X1N:0,504\r"),
+        (b"X1N\r", b"X1N:0,500\r"),
         (b"X1E\r", b"X1E:500\r"),
     )
 
