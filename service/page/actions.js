@@ -17,6 +17,11 @@ export function actionsFor(state) {
   const free = idle && robot.linked && !robot.stopped && robot.armed && !state.ready && !robot.insertion_locked;
   const list = [];
   const add = (label, run, possible, extra = {}) => { if (possible) list.push({ label, run, ...extra }); };
+  if (!state.case_folder) return list; // see case_desk.js
+  if (state.case_question) {
+    add("The needle is out: unlock", post("needle-out"), robot.linked && robot.insertion_locked);
+    return list;
+  }
   add(robot.stopped ? "Re-arm the robot" : "Arm the robot", post("reset"),
     robot.linked && !robot.moving && (robot.stopped || !robot.armed || !robot.position_certain));
   if (state.ready) {

@@ -2,6 +2,7 @@
 
 import { get, stopRobot } from "./api.js";
 import { byId, setHidden, setText, whenChanged } from "./dom.js";
+import { drawCaseDesk, drawHolding } from "./case_desk.js";
 import { drawHead, drawLights, showLost, showUp, startClock } from "./header.js";
 import { drawHistory } from "./history_plot.js";
 import { Images } from "./images.js";
@@ -32,6 +33,9 @@ function draw(state) {
   drawProposals({ proposals: state.proposals ?? [], role: page.role });
   drawJog({ positions_um: robot.positions_um, possible: page.role === "operator" && state.jog_possible });
   drawCase({ description: state.case, case_uid: state.case_uid, role: page.role });
+  const desk = { folder: state.case_folder, role: page.role, busy: Boolean(state.procedure) };
+  drawCaseDesk({ ...desk, begins: state.cases_begin_here, asks: Boolean(state.case_question) });
+  drawHolding({ ...desk, holding: state.holding });
   drawScannerClock({ clock: state.clock, clock_implies: state.clock_implies, role: page.role });
   drawParts({ robot: { linked: robot.linked, boot_id: robot.boot_id, problem: robot.problem }, processes: state.processes, slices: state.slices });
   newAside([state.slices.quarantined, state.hold?.hold_id, page.role]);
@@ -77,6 +81,11 @@ const live = new Live({
   },
 });
 
+function noCase(error) {
+  if (error.code === "no_case") return [];
+  throw error;
+}
+
 async function begin() {
   let me;
   try {
@@ -88,7 +97,7 @@ async function begin() {
   page.role = me.role;
   setText(byId("who"), me.needs_token ? `${me.name} (${me.role})` : "");
   setHidden(byId("leave"), !me.needs_token);
-  const events = await get("api/v1/events?newest=true&limit=120");
+  const events = await get("api/v1/events?newest=true&limit=120").catch(noCase);
   byId("events").replaceChildren();
   events.reverse().forEach(addEvent);
   live.open(events.at(-1)?.event_id ?? 0);

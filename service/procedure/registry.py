@@ -16,9 +16,9 @@ from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_recording import GuidePlace, GuideRecordingArguments, record_guide
 from service.procedure.jog import JogEnd, jog
 from service.procedure.recording import Place, RecordingArguments, record_place
+from service.procedure.scan_frame import calibration_good_since
 from service.procedure.sensing import ValidationGate
 from service.procedure.steps import ProcedureSteps
-from service.procedure.validity import calibration_good_since
 
 CALIBRATION = "calibration"
 APPROACH = "approach"

@@ -19,7 +19,7 @@ from case_record.rows import Event
 from service.procedure.guide_geometry import GuideGeometry, state_on_line
 from service.procedure.kinematics import KinematicsError, line_from_entry_and_target
 from service.procedure.plane import ImagePlane
-from service.procedure.validity import places_good_since
+from service.procedure.scan_frame import places_good_since
 
 Array = NDArray[np.float64]
 TARGET_SET, TARGET_WITHDRAWN = "target_set", "target_withdrawn"

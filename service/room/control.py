@@ -30,8 +30,8 @@ from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steps import Outcome, Step
 from service.procedure.targets import ENTRY_SET, TARGET_SET
 from service.room.alarms import Condition
-from service.room.between_cases import BetweenCases
-from service.room.case_life import CaseLife, is_finished, set_at_rest
+from service.room.cases.between import BetweenCases
+from service.room.cases.life import CaseLife, is_finished, set_at_rest
 from service.room.commands.commands import Commands
 from service.room.conditions import conditions
 from service.room.context import Room

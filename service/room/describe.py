@@ -13,7 +13,8 @@ from case_record.rows import Measurement, SliceRow
 from room_config.load import Config
 from service.procedure.targets import current_entry, current_target
 from service.room.alarms import AlarmBook, Condition
-from service.room.case_life import QUESTION, CaseLife
+from service.room.cases.held import HeldSlices, arriving
+from service.room.cases.life import QUESTION, CaseLife
 from service.room.conditions import HANGS, conditions
 from service.room.context import now_of
 from service.room.describe_measurement import (
@@ -23,7 +24,6 @@ from service.room.describe_measurement import (
     describe_reconstruction,
 )
 from service.room.execution import Execution
-from service.room.held_slices import HeldSlices, arriving
 from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
 from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now

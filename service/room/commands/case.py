@@ -8,7 +8,7 @@ from typing import Any
 
 from dicom_listener.taking import TakingError, accept_frame, take_study
 from robot_bridge.client.client import BridgeError
-from service.room.case_life import CONTINUED, FINISHED, CaseLife
+from service.room.cases.life import CONTINUED, FINISHED, CaseLife
 from service.room.context import Room
 from service.room.present import needle_may_be_in
 from service.room.readiness import ConflictError

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from service.room.case_life import CaseLife
+from service.room.cases.life import CaseLife
 from service.room.commands.case import CaseCommands
 from service.room.commands.procedure import ProcedureCommands
 from service.room.commands.proposals import ProposalCommands

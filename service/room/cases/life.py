@@ -15,7 +15,7 @@ from pathlib import Path
 from case_record.cases import Cases
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Event
-from service.procedure.validity import CASE_REOPENED
+from service.procedure.scan_frame import CASE_REOPENED
 
 FINISHED, REOPENED, CONTINUED = "case_finished", CASE_REOPENED, "case_continued"
 DESCRIBED = "case_described"

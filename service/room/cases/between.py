@@ -10,8 +10,8 @@ import structlog
 from case_record.cases import Cases
 from room_config.load import Config
 from service.room.alarms import Condition
-from service.room.case_life import begin, reopen
-from service.room.held_slices import HeldSlices
+from service.room.cases.held import HeldSlices
+from service.room.cases.life import begin, reopen
 from service.room.readiness import ConflictError
 from service.room.state import AlarmState, ProcessState, RobotState, RoomState
 
