@@ -14,8 +14,8 @@ from dicom_slice.read import Frame, read_frames
 from dicom_slice.reasons import UnusableError
 from service.cli.files import BadFileError, files_of, geometry_of, read_shift_table
 from sr_engine.errors import EngineError
-from sr_engine.template import Template, learn_template
-from sr_engine.template_fit import TemplateFit
+from sr_engine.template.fit import TemplateFit
+from sr_engine.template.learn import Template, learn_template
 
 Array = np.ndarray[Any, np.dtype[np.float64]]
 

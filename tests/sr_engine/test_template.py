@@ -17,7 +17,7 @@ from sr_engine.errors import (
     TemplateMismatchError,
 )
 from sr_engine.simulate import render_disc, rician
-from sr_engine.template import Template, learn_template
+from sr_engine.template.learn import Template, learn_template
 
 OUTSIDE = Path(__file__).parents[1] / "data/outside_physics"
 LEARNT_FROM = 9

@@ -1,7 +1,7 @@
 """The fiducial's own image as the template: learnt at known displacements, for any shape.
 
 Where it is known how the object was displaced from frame to frame, its image follows (see
-`object_image`), and every frame can be fitted with that image instead of with a disc. The frames
+`image`), and every frame can be fitted with that image instead of with a disc. The frames
 also show what remains: the noise's size at every level of signal, its correlation, and whether they
 were displaced as is said.
 """
@@ -12,15 +12,20 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from sr_engine.absolute_centre import absolute_centre
 from sr_engine.checks import checked_frames, checked_shifts
-from sr_engine.correlation import believed, correlation_matrix, lag_correlation, weight_matrix
 from sr_engine.errors import EngineError, TemplateError
-from sr_engine.moving import Moving, moving_object
 from sr_engine.noise import NoiseKind
-from sr_engine.object_image import ObjectImage, Views, averaged_image, magnitude_image
-from sr_engine.template_fit import Metric, TemplateFit, fit_image, linear_fit, patch_of
-from sr_engine.template_search import find_object
+from sr_engine.template.correlation import (
+    believed,
+    correlation_matrix,
+    lag_correlation,
+    weight_matrix,
+)
+from sr_engine.template.fit import Metric, TemplateFit, fit_image, linear_fit, patch_of
+from sr_engine.template.image import ObjectImage, Views, averaged_image, magnitude_image
+from sr_engine.template.middle import absolute_centre
+from sr_engine.template.moving import Moving, moving_object
+from sr_engine.template.search import find_object
 
 Array = NDArray[np.float64]
 

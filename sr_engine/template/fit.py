@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 
 from sr_engine.errors import NotConvergedError, ObjectAtBorderError, TemplateMismatchError
 from sr_engine.noise import NoiseKind, moments
-from sr_engine.object_image import ObjectImage
 from sr_engine.signal import SLOPE_SCALES, mixture_precision
+from sr_engine.template.image import ObjectImage
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -10,8 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_fill_holes, label
 
-from sr_engine.object_image import ObjectImage
 from sr_engine.roundness import REACH_PX, refine_circle
+from sr_engine.template.image import ObjectImage
 
 Array = NDArray[np.float64]
 

@@ -7,8 +7,8 @@ from scipy.signal import oaconvolve
 
 from sr_engine.errors import AmbiguousObjectError, NoRoundObjectError
 from sr_engine.noise import moments
-from sr_engine.object_image import ObjectImage
-from sr_engine.template_fit import Metric
+from sr_engine.template.fit import Metric
+from sr_engine.template.image import ObjectImage
 
 Array = NDArray[np.float64]
 
