@@ -121,6 +121,12 @@ class Connection:
                 self._db.execute("ROLLBACK")
             raise
 
+    def _next_seq(self) -> int:
+        """The next number in the order of all that happens; call it inside a transaction."""
+        assert self._db.in_transaction
+        row = self._db.execute("UPDATE sequence SET last = last + 1 RETURNING last").fetchone()
+        return int(row[0])
+
     def data_version(self) -> int:
         """A number that changes when another connection has committed something."""
         return int(self._db.execute("PRAGMA data_version").fetchone()[0])

@@ -164,6 +164,17 @@ class Intake:
         self._done.add(name)
         self._metrics.intake_seconds.observe(max(0.0, time.time() - envelope.received_s))
 
+    def set_aside(self, path: Path, text: str) -> None:
+        """Record one inbox file that is not to be read; for the rest as `take`."""
+        name = self._named(path)
+        if name in self._done or not path.exists():
+            return
+        envelope = self._envelope(path)
+        reason = SetAside(Reason.UNREADABLE, text)
+        self._write([row_without_header(envelope, name, reason)], [None], envelope)
+        self._done.add(name)
+        self.alarm("intake_failed", f"{name}: {text}")
+
     def alarm(self, kind: str, text: str) -> None:
         """Count, log and record something that a person should know of."""
         self._metrics.alarms.labels(kind).inc()

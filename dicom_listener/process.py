@@ -12,6 +12,7 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import structlog
 
+from case_record.attempts import MOST_DEATHS, Attempts
 from case_record.cases import Cases
 from case_record.presence import Presence, Sole
 from case_record.record import CaseRecord
@@ -42,6 +43,10 @@ class Ready:
     port: int
     metrics_port: int | None
     ae_title: str
+
+
+class ListeningEndedError(RuntimeError):
+    """Nothing is received any more: the process ends, so that it is started again."""
 
 
 class PortError(ConfigError):
@@ -165,7 +170,8 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         presence = stack.enter_context(Presence(case_dir, "listener"))
         retention_s = config.listener.retention_days * 86400
         tending = Tending(record, inbox, intake, retention_s)
-        _loop(intake, scp, tending, received, stop, presence)
+        attempts = stack.enter_context(Attempts(case_dir, "listener"))
+        _loop(intake, scp, tending, received, stop, presence, attempts)
 
 
 def _loop(
@@ -175,20 +181,26 @@ def _loop(
     received: "SimpleQueue[Path]",
     stop: threading.Event,
     presence: Presence,
+    attempts: Attempts,
 ) -> None:
     while not stop.is_set():
         presence.beat()
+        if not scp.is_listening:
+            raise ListeningEndedError("the thread that listens on the port has ended")
         try:
-            _take_received(intake, received)
+            _take_received(intake, received, attempts)
             intake.look_at_record()
             while scp.alarms:
                 intake.note_alarm(*scp.alarms.popleft())
             tending.turn()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, OSError) as error:
             # The slices are safe in the inbox: tried again until the record can be written.
             log.error("the case record cannot be written", error=str(error))
             stop.wait(_RECORD_RETRY_S)
             _requeue(intake, received)
+        except Exception:  # receiving and storing go on, whatever the rest of the loop meets
+            log.exception("the listener's loop")
+            stop.wait(_RECORD_RETRY_S)
 
 
 class Tending:
@@ -225,12 +237,23 @@ def _requeue(intake: Intake, received: "SimpleQueue[Path]") -> None:
         received.put(path)
 
 
-def _take_received(intake: Intake, received: "SimpleQueue[Path]") -> None:
+def _take_received(intake: Intake, received: "SimpleQueue[Path]", attempts: Attempts) -> None:
     """Wait for at most one poll, then take whatever is there."""
     try:
         path = received.get(timeout=_POLL_S)
         while True:
-            intake.take(path)
+            _take(intake, path, attempts)
             path = received.get_nowait()
     except Empty:
         return
+
+
+def _take(intake: Intake, path: Path, attempts: Attempts) -> None:
+    """One file; one over which the listener was killed again and again is not read any more."""
+    deaths = attempts.deaths(path.name)
+    if deaths >= MOST_DEATHS:
+        intake.set_aside(path, f"the listener ended {deaths} times while it read this file")
+        attempts.forget(path.name)
+        return
+    with attempts.at(path.name):
+        intake.take(path)

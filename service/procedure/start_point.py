@@ -47,32 +47,32 @@ def is_untouched(record: CaseRecord, measurement_id: int) -> bool:
     newest = record.last_measurement("done")
     if newest is not None and newest.measurement_id != measurement_id:
         return False
-    since_s = record.measurement(measurement_id).finished_s
-    if since_s is None:
+    since = record.measurement(measurement_id).requested_seq
+    if not record.measurement(measurement_id).finished_seq:
         return False
     declared = record.last_event(POSITION_DECLARED)
-    if declared is not None and declared.wall_s > since_s:
+    if declared is not None and declared.seq > since:
         return False
-    return all(move.sent_s <= since_s for move in record.moves())
+    return record.last_sent_seq() <= since
 
 
 def positions_to_declare(record: CaseRecord, positions_um: Mapping[str, int]) -> dict[str, int]:
-    """Where the robot is taken to stand after a restart, per axis: by its count, or by the record.
+    """Where axes are taken to stand after a restart, each by its own count, or by the record.
 
-    Controllers without encoders that were switched off count from zero wherever they stand. Were
-    that taken for the truth, the travel limits would wander with every restart. So where the count
-    is zero and the record knows better, the record is believed; of a move that came to no end, half
-    of it. Either is uncertain: the next procedure looks before it moves.
+    positions_um: the counts of the axes in question. Controllers without encoders that were
+    switched off count from zero wherever they stand. Were that taken for the truth, the travel
+    limits would wander with every restart. So where a count is zero and the record knows better,
+    the record is believed; of a move that came to no end, half of it. It is a guess either way.
     """
     holds, moves = record.holds(), record.moves()
-    if any(positions_um.values()) or not holds:
+    if not holds:
         return dict(positions_um)
     known = dict(holds[-1].readback_um)
     last = moves[-1] if moves else None
-    if last is not None and last.ended_s is None and last.sent_s > holds[-1].settled_at_s:
+    if last is not None and last.ended_s is None and last.sent_seq > holds[-1].begun_seq:
         if all(setpoint_um == 0 for setpoint_um in last.setpoints_um.values()):
             return dict(positions_um)  # it may well be there
         known = {
             axis: (at_um + last.setpoints_um.get(axis, at_um)) // 2 for axis, at_um in known.items()
         }
-    return {axis: known.get(axis, at_um) for axis, at_um in positions_um.items()}
+    return {axis: at_um or known.get(axis, at_um) for axis, at_um in positions_um.items()}

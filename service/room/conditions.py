@@ -32,6 +32,10 @@ def conditions(state: RoomState) -> list[Condition]:
     if robot.linked and not robot.position_certain:
         text = "The robot's position is not certain"
         found.append(Condition("position", "warning", text, "Re-arm, then measure."))
+    if state.ready_lost is not None:
+        text = f"READY was lost: {state.ready_lost.text}"
+        what = "Say when the needle is out; then start the approach: it measures again."
+        found.append(Condition("ready_lost", "alarm", text, what))
     for process in state.processes:
         if process.condition == "down" or process.detail == HANGS:
             text = f"The {process.name} {process.detail}"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -18,9 +18,17 @@ from service.procedure.registry import latest_calibration
 from service.procedure.start_point import start_point
 from service.room.execution import Execution
 from service.room.link import RoomLink
-from service.room.readiness import ConflictError, may_start
+from service.room.motion_allowed import may_start
+from service.room.present import Now
+from service.room.readiness import ConflictError
+from service.room.stop_latch import StopLatch
 
 SOURCE = "service"
+
+
+def now_of(config: Config, link: RoomLink) -> Now:
+    """How things stand beside the record: the robot, and how long a measurement is good for."""
+    return Now(link.status, config.service.ready_valid_s, link.problem)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +39,11 @@ class Room:
     record: CaseRecord
     link: RoomLink
     execution: Execution
+    stops: StopLatch = field(default_factory=StopLatch)
+
+    def now(self) -> Now:
+        """How things stand beside the record."""
+        return now_of(self.config, self.link)
 
     def note(self, kind: str, by: str, body: dict[str, Any]) -> None:
         self.record.append_event(kind, body, source=SOURCE, who=by)
@@ -38,7 +51,8 @@ class Room:
     def begin(self, name: str, arguments: dict[str, Any], by: str) -> int:
         with self.record.transaction():
             number = self.record.begin_procedure(name, arguments)
-            self.note(f"{name}_started", by, {"procedure_id": number})
+            body = {"procedure_id": number, **self.execution.permitted_by()}
+            self.note(f"{name}_started", by, body)
         return number
 
     def abort(self, reason: str) -> None:
@@ -53,7 +67,9 @@ class Room:
 
     def check_may_start(self) -> None:
         self.linked()
-        refusal = may_start(self.record, self.link.status)
+        if self.stops.standing:
+            raise ConflictError("not_armed", "STOP was pressed: re-arm the robot first.")
+        refusal = may_start(self.record, self.now())
         if refusal is not None:
             raise refusal
 
@@ -67,7 +83,7 @@ class Room:
         return configured if guide or guide is None else None
 
     def travel(self) -> dict[str, Travel]:
-        return {axis: Travel(low, high) for axis, (low, high) in self.link.travel_um.items()}
+        return {axis: Travel(low, high) for axis, (low, high) in self.link.travel_left_um.items()}
 
     def seed(self) -> int:
         """Of the next procedure's random choices: from the case's seed and its number."""

@@ -14,6 +14,7 @@ from room_config.load import Config
 from service.procedure.targets import current_entry, current_target
 from service.room.alarms import AlarmBook, Condition
 from service.room.conditions import HANGS, conditions
+from service.room.context import now_of
 from service.room.describe_measurement import (
     describe_error,
     describe_measurement,
@@ -22,15 +23,18 @@ from service.room.describe_measurement import (
 )
 from service.room.execution import Execution
 from service.room.link import RoomLink
+from service.room.motion_allowed import may_start
+from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
 from service.room.prompt import is_calibrated, outcome_text, prompt
 from service.room.proposals import ProposalBook
-from service.room.readiness import may_start, ready_arrival
 from service.room.state import (
     AcquisitionState,
     ArrivalState,
     CaseState,
     ClockState,
     HoldState,
+    LostState,
+    MeasurementState,
     ProcessState,
     QuestionState,
     RobotState,
@@ -72,28 +76,31 @@ class Describer:
         target = current_target(record)
         target_mm = list(target.patient_mm) if target else None
         measurement = record.last_measurement()
-        arrival = _arrival(record)
+        now = now_of(config, link)
+        found = readiness(record, now)
+        arrival = _arrival(record, found, now)
         state = before.model_copy(
             update={
                 "at_s": time.time(),
                 "case_uid": case.case_uid if case else "",
                 "case": _case(record),
                 **_procedures(record, execution),
-                "prompt": prompt(config, record, link, execution, arrival is not None),
+                "prompt": prompt(config, record, link, execution, found),
                 "ready": arrival is not None,
+                "ready_lost": _lost_ready(found),
                 "arrival": arrival,
-                "punctured": arrival is not None and _punctured(record, arrival.procedure_id),
+                "punctured": found is not None and _punctured(record, found.procedure_id),
                 "robot": describe_robot(link, before.robot),
-                "jog_possible": may_start(record, link.status) is None,
+                "jog_possible": may_start(record, now) is None,
                 "hold": _hold(record),
                 **_slices(record),
-                "measurement": None if measurement is None else describe_measurement(measurement),
+                "measurement": _measurement(record, measurement, now),
                 **self._around(measurement, before),
                 "clock": _clock(config, record),
                 "calibrated": is_calibrated(config, record),
                 "target_patient_mm": tuple(target_mm) if target_mm else None,
                 "entry_patient_mm": current_entry(record),
-                "error": describe_error(config, record, target_mm),
+                **_error(config, record, target_mm, now),
                 "event_id": record.last_event_id(),
                 "processes": self._look_at_processes(),
                 "proposals": self._proposals.update(record),
@@ -101,7 +108,7 @@ class Describer:
         )
         alarms = self._alarms.update([*conditions(state), *self._others_wrong()], record)
         state = state.model_copy(update={"alarms": alarms})
-        same = state.model_copy(update={"at_s": before.at_s}) == before
+        same = _timeless(state) == _timeless(before)
         return state.model_copy(update={"revision": before.revision + (not same)})
 
     def _around(self, last: Measurement | None, before: RoomState) -> dict[str, Any]:
@@ -211,14 +218,57 @@ def _slice(row: SliceRow) -> SliceState | None:
     )
 
 
-def _arrival(record: CaseRecord) -> ArrivalState | None:
-    """Of the approach whose target the needle guide is at."""
-    arrival = ready_arrival(record)
-    if arrival is None:
+def _arrival(record: CaseRecord, found: Readiness | None, now: Now) -> ArrivalState | None:
+    """Of the approach whose target the needle guide is at now."""
+    if found is None or not found.ready:
         return None
-    procedure_id, result = arrival
+    result = found.arrival
     known = {name: result[name] for name in ArrivalState.model_fields if name in result}
-    return ArrivalState(procedure_id=procedure_id, **known)
+    measurement = record.measurement(int(result["measurement_id"]))
+    age = age_s(measurement.request[RESTS_ON], now)
+    return ArrivalState(procedure_id=found.procedure_id, **{**known, "age_s": age})
+
+
+def _lost_ready(found: Readiness | None) -> LostState | None:
+    if found is None or found.lost is None:
+        return None
+    return LostState(code=found.lost.code, text=found.lost.text)
+
+
+def _measurement(record: CaseRecord, last: Measurement | None, now: Now) -> MeasurementState | None:
+    if last is None:
+        return None
+    facts = last.request.get(RESTS_ON)
+    lost = why_not_now(record, last, now) if last.state == "done" else None
+    update = {
+        "lost": None if lost is None else LostState(code=lost.code, text=lost.text),
+        "age_s": None if facts is None else age_s(facts, now),
+    }
+    return describe_measurement(last).model_copy(update=update)
+
+
+def _error(
+    config: Config, record: CaseRecord, target_mm: list[float] | None, now: Now
+) -> dict[str, Any]:
+    """How far off it is now; if that is not known, why not."""
+    last = record.last_measurement("done")
+    if last is None:
+        return {"error": None, "error_reason": "nothing was measured yet"}
+    if target_mm is None:
+        return {"error": None, "error_reason": "no target is set"}
+    lost = why_not_now(record, last, now)
+    if lost is not None:
+        return {"error": None, "error_reason": lost.text}
+    error = describe_error(config, record, target_mm)
+    return {"error": error, "error_reason": "" if error else "not calibrated"}
+
+
+def _timeless(state: RoomState) -> RoomState:
+    """The state without what changes by time alone."""
+    ageless = {"age_s": None}
+    parts = {name: getattr(state, name) for name in ("measurement", "arrival")}
+    younger = {name: part and part.model_copy(update=ageless) for name, part in parts.items()}
+    return state.model_copy(update={"at_s": 0.0, "revision": 0, **younger})
 
 
 def _punctured(record: CaseRecord, procedure_id: int) -> bool:

@@ -84,6 +84,12 @@ class StopBody(_Body):
     emergency: bool = Field(default=False, description="True: also park the drives.")
 
 
+class StopAnswer(BaseModel):
+    """What became of a STOP by the time of the answer."""
+
+    outcome: Literal["stopped", "on_its_way", "not_delivered"]
+
+
 class JogBody(Ask):
     axis: str = Field(min_length=1, max_length=32, examples=["xt"])
     distance_um: int = Field(ge=-5000, le=5000, examples=[100], description="At most 5 mm.")

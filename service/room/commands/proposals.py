@@ -9,7 +9,7 @@ from dataclasses import asdict
 from typing import Any
 
 from service.procedure.registry import latest_calibration
-from service.room.commands_target import TargetCommands
+from service.room.commands.target import TargetCommands
 from service.room.context import Room
 from service.room.proposals import (
     MOST_OPEN,
