@@ -58,8 +58,8 @@ class CameraConfig(BaseModel):
     """A picture that arrives now was exposed no longer ago than this."""
     stall_s: Positive = 2.0
     """No picture for so long: the camera has stalled."""
-    most_overexposed: Annotated[float, Field(ge=0, le=1)] = 0.02
-    """Largest share of the slice's pixels that may stand at the top of the range."""
+    most_overexposed: Annotated[float, Field(ge=0, le=1)] = 0.005
+    """Largest share of the picture's pixels that may stand at the top of the range."""
     service_url: Annotated[str, Field(pattern=r"^https?://[^\s/]+")] = "http://127.0.0.1:8080"
     """The service, which says what to acquire next."""
     token_file: str = ""

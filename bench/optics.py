@@ -153,7 +153,7 @@ def learn_lens(pictures: list[Picture], squares: tuple[int, int], square_mm: flo
 
 
 def _squared_up(homography: Floats) -> Floats:
-    """Turn the sheet's axes along the picture's, however the board lay; origin on the optical axis."""
+    """Turn the sheet: its axes along the picture, its origin on the optical axis."""
     inverse = np.linalg.inv(homography)
     middle = inverse @ np.array([0.0, 0.0, 1.0])
     right = inverse @ np.array([1e-3, 0.0, 1.0])
@@ -189,7 +189,7 @@ class Resampler:
             assert config.sensor_px_per_mm is not None
             where = points[..., ::-1] * config.sensor_px_per_mm + np.array(middle)
         else:
-            offset_mm = _sheet_of(lens, np.array(middle, dtype=np.float64))
+            offset_mm = sheet_of(lens, np.array(middle, dtype=np.float64))
             where = lens.picture_from_sheet(points + offset_mm)
         low, high = where.min(axis=(0, 1)), where.max(axis=(0, 1))
         if not (low > -0.5).all() or not (high < np.array(picture_shape) - 0.5).all():
@@ -215,7 +215,7 @@ def _sheet_points(shape: tuple[int, int], pixel_mm: float) -> Floats:
     return np.stack([x, y], axis=-1)
 
 
-def _sheet_of(lens: Lens, point_px: Floats) -> Floats:
+def sheet_of(lens: Lens, point_px: Floats) -> Floats:
     """The sheet point (x, y) mm that a picture point (row, col) shows; Newton's method."""
     point = np.zeros(2)
     for _ in range(20):

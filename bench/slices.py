@@ -16,6 +16,7 @@ from sr_engine.errors import EngineError
 
 Floats = NDArray[np.float64]
 _TOP = 254
+_FAINT = 0.4  # of the strongest contrast
 
 
 @dataclass(frozen=True, eq=False)
@@ -82,9 +83,11 @@ class BenchCamera:
         low_mm, high_mm = self._room.radius_mm
         radii_px = (low_mm / self.config.pixel_mm, high_mm / self.config.pixel_mm)
         try:
-            return len(detect(taken.pixels, radii_px))
+            contrasts = [abs(found.contrast) for found in detect(taken.pixels, radii_px)]
         except EngineError:
             return 0
+        # what is faint beside the circle (a corner of the sheet, a shadow) is none
+        return sum(contrast > _FAINT * max(contrasts) for contrast in contrasts)
 
     def complaint_about(self, taken: BenchSlice) -> str:
         """One line where the circle is not the one thing in view; else ''."""

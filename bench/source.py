@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import contextlib
 import glob
+import itertools
 import os
 import threading
 import time
+from collections import deque
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,16 +24,22 @@ Picture = NDArray[np.uint8]
 _PICTURE_SUFFIXES = (".png", ".jpg", ".jpeg", ".bmp", ".tif", ".tiff")
 _FOLDER_RATE_HZ = 15.0
 _OPEN_PATIENCE_S = 10.0
+_RECENT = 8  # pictures from which the rate is told
+_WAITED = 0.3  # of a period: shorter waits are those of a queue
 
 
 @dataclass(frozen=True, eq=False)
 class Exposure:
-    """picture (rows, cols, 3), RGB; it was exposed between `from_s` and `to_s` (time.time)."""
+    """picture (rows, cols, 3), RGB; it was exposed between `from_s` and `to_s` (time.time).
+
+    fresh: whoever read it had to wait for it, so it had not stood in a queue.
+    """
 
     picture: Picture
     from_s: float
     to_s: float
     number: int
+    fresh: bool
 
 
 class FrameSource:
@@ -105,20 +113,37 @@ class FrameSource:
             return newest
 
     def exposed_after(self, instant_s: float, count: int) -> list[Exposure]:
-        """`count` pictures whose exposure began after `instant_s` (time.time)."""
+        """`count` pictures whose exposure began after `instant_s` (time.time).
+
+        A picture that came out of a queue may be older than it seems and is passed over; raises
+        CameraError where all do.
+        """
         found: list[Exposure] = []
-        number = 0
+        number, last_s = 0, time.monotonic()
         while len(found) < count:
             exposure = self.next_after(number)
             number = exposure.number
-            if exposure.from_s >= instant_s:
-                found.append(exposure)
+            if exposure.fresh:
+                last_s = time.monotonic()
+                if exposure.from_s >= instant_s:
+                    found.append(exposure)
+            elif time.monotonic() - last_s > self._stall_s:
+                raise CameraError(
+                    f"camera {self._source}: pictures come faster than this computer reads them; "
+                    "lower the camera's rate or resolution"
+                )
         return found
 
     def _run(self) -> None:
         try:
-            for number, picture in enumerate(_pictures(self._source, self._stopped), start=1):
-                self._take(picture, number)
+            queue = QueueWatch()
+            pictures = _pictures(self._source, self._stopped)
+            for number in itertools.count(1):
+                began_s = time.monotonic()
+                picture = next(pictures, None)
+                if picture is None:
+                    break
+                self._take(picture, number, queue.is_empty(began_s, time.monotonic()))
             problem = f"camera {self._source}: there are no more pictures"
         except CameraError as error:
             problem = str(error)
@@ -128,7 +153,7 @@ class FrameSource:
             self._problem = problem
             self._changed.notify_all()
 
-    def _take(self, picture: Picture, number: int) -> None:
+    def _take(self, picture: Picture, number: int, fresh: bool) -> None:
         now_s = time.time()
         with self._changed:
             before = self._newest
@@ -139,8 +164,23 @@ class FrameSource:
                     f"camera {self._source}: the picture changed from {was_cols} x {was_rows} to "
                     f"{cols} x {rows} pixels; set its resolution and start again"
                 )
-            self._newest = Exposure(picture, now_s - self._latency_s, now_s, number)
+            self._newest = Exposure(picture, now_s - self._latency_s, now_s, number, fresh)
             self._changed.notify_all()
+
+
+class QueueWatch:
+    """Tells from how long the reader waited whether pictures queue up between camera and reader."""
+
+    def __init__(self) -> None:
+        self._arrivals_s: deque[float] = deque(maxlen=_RECENT)
+
+    def is_empty(self, asked_s: float, arrived_s: float) -> bool:
+        """Whether the picture that arrived was waited for, by the rate of the ones before it."""
+        self._arrivals_s.append(arrived_s)
+        if len(self._arrivals_s) < _RECENT:
+            return False
+        period_s = (self._arrivals_s[-1] - self._arrivals_s[0]) / (_RECENT - 1)
+        return arrived_s - asked_s > _WAITED * period_s
 
 
 def _pictures(source: str, stopped: threading.Event) -> Iterator[Picture]:

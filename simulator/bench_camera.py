@@ -1,7 +1,7 @@
 """A virtual camera over the virtual robot: a real MJPEG stream over HTTP.
 
-A pinhole camera that stands a little askew, with a lens that bends, an unsharp image, noise and JPEG,
-looks at a red circle on a white sheet on the top stage. The stages are wherever the emulated motors
+A pinhole camera that stands a little askew, with a lens that bends, an unsharp image, noise and
+JPEG, looks at a red circle on a white sheet on the top stage. The stages are where the motors
 truly have them. `python -m simulator.bench_camera` serves it; with --board it writes pictures of a
 checkerboard instead, as somebody would take them to learn the lens.
 """
@@ -66,6 +66,15 @@ class VirtualCamera:
         row = (np.arange(rows * n) + 0.5) / n - rows / 2
         col = (np.arange(cols * n) + 0.5) / n - cols / 2
         bent = np.stack(np.meshgrid(col, row), axis=-1) / self.focal_px
+        return self._sheet_of(bent, tilt_deg, height_mm)
+
+    def true_sheet_mm(self, picture_px: Floats) -> Floats:
+        """Sheet point (x, y) mm that a picture point (..., 2) in (row, col) truly shows."""
+        middle = (np.array(self.shape) - 1) / 2
+        bent = ((np.asarray(picture_px) - middle) / self.focal_px)[..., ::-1]
+        return self._sheet_of(bent, self.tilt_deg, self.height_mm)
+
+    def _sheet_of(self, bent: Floats, tilt_deg: Sequence[float], height_mm: float) -> Floats:
         rays = bent.copy()
         k1, k2 = self.distortion
         for _ in range(8):  # the lens bends ideal rays into these
