@@ -102,29 +102,32 @@ def test_a_killed_service_goes_on_with_the_case_that_was_open(tmp_path):
         assert state.case_question == ""
 
 
-def left_open(folder: Path, ago: timedelta) -> Path:
+@pytest.fixture
+def left_open(tmp_path, monkeypatch):
     """A case with a running procedure and an open hold, last touched some time ago."""
-    cases = Cases(folder / "cases")
-    made = cases.make_folder()
-    with CaseRecord(made, create=True) as record:
-        record.start_case("room", 0)
-        record.begin_hold(
-            set_id=1, place=0, setpoints_um={}, readback_um={}, shift_um={}, shift_px=(0.0, 0.0),
-            settled_at_s=time.time(),
-        )  # fmt: skip
-        record.begin_procedure("jog", {"setpoints_um": {"xt": 0}})
-    # events are never changed: the whole record is aged, as if by a clock of that time
-    db = sqlite3.connect(made / "case.sqlite")
-    db.execute("DROP TRIGGER event_is_never_changed")
-    db.execute("UPDATE event SET wall_s = wall_s - ?", (ago.total_seconds(),))
-    db.commit()
-    db.close()
-    cases.set_open(made)
-    return made
+
+    def leave(ago: timedelta) -> Path:
+        cases = Cases(tmp_path / "cases")
+        made = cases.make_folder()
+        now_s = time.time
+        with monkeypatch.context() as clock, CaseRecord(made, create=True) as record:
+            clock.setattr(time, "time", lambda: now_s() - ago.total_seconds())
+            record.start_case("room", 0)
+            record.begin_hold(
+                set_id=1, place=0, setpoints_um={}, readback_um={}, shift_um={},
+                shift_px=(0.0, 0.0), settled_at_s=time.time(),
+            )  # fmt: skip
+            record.begin_procedure("jog", {"setpoints_um": {"xt": 0}})
+        cases.set_open(made)
+        return made
+
+    return leave
 
 
-def test_a_case_of_yesterday_is_asked_about_and_nothing_of_it_goes_on_by_itself(tmp_path):
-    folder = left_open(tmp_path, timedelta(days=1))
+def test_a_case_of_yesterday_is_asked_about_and_nothing_of_it_goes_on_by_itself(
+    tmp_path, left_open
+):
+    folder = left_open(timedelta(days=1))
     with running(tmp_path) as client:
         state = wait_for(client.state, lambda s: s.case_folder)
         assert "another day" in state.case_question
@@ -145,8 +148,8 @@ def test_a_case_of_yesterday_is_asked_about_and_nothing_of_it_goes_on_by_itself(
         assert record.last_event("procedure_aborted").body["reason"].endswith("another day")
 
 
-def test_a_case_of_yesterday_can_be_finished_instead(tmp_path):
-    folder = left_open(tmp_path, timedelta(days=1))
+def test_a_case_of_yesterday_can_be_finished_instead(tmp_path, left_open):
+    folder = left_open(timedelta(days=1))
     with running(tmp_path) as client:
         wait_for(client.state, lambda s: s.case_question)
         assert client.finish_case() == folder.name
@@ -154,8 +157,8 @@ def test_a_case_of_yesterday_can_be_finished_instead(tmp_path):
         assert client.state().case_question == ""
 
 
-def test_a_case_of_an_hour_ago_is_not_asked_about(tmp_path):
-    left_open(tmp_path, timedelta(minutes=50))
+def test_a_case_of_an_hour_ago_is_not_asked_about(tmp_path, left_open):
+    left_open(timedelta(minutes=50))
     with running(tmp_path) as client:
         assert wait_for(client.state, lambda s: s.case_folder).case_question == ""
 
