@@ -294,7 +294,7 @@ def _contradiction(clock: ScannerClock, slice_: Received, rules: ClockRules) -> 
 
 
 def _ahead_s(slice_: Received, compared: OffsetBounds, rules: ClockRules) -> float:
-    """By how much the scanner's clock must have been ahead of the comparison; below 0: it need not."""
+    """By how much the scanner's clock must have been ahead of the comparison, if above 0."""
     least_s = 0.0 if rules.promptness is None else rules.promptness.least_s
     return compared.low_s + least_s - slice_.most_lag_s
 
