@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import sqlite3
 from collections.abc import Iterator
@@ -24,6 +25,8 @@ class CaseRecordError(Exception):
 class RecordUnavailableError(CaseRecordError):
     """The record cannot be opened now: locked by another, a full disk, a mount that is gone."""
 
+    exit_code = 3
+
 
 class Connection:
     """What every part of the record stands on. Use it in the thread that opened it.
@@ -43,9 +46,11 @@ class Connection:
         self.case_dir = Path(case_dir)
         path = self.case_dir / FILE_NAME
         if create:
-            self.case_dir.mkdir(parents=True, exist_ok=True)
+            self.case_dir.mkdir(parents=True, exist_ok=True, mode=0o700)
         elif not path.is_file():
             raise CaseRecordError(f"{self.case_dir}: no case record ({FILE_NAME}) in this folder")
+        if create:
+            _for_its_owner_alone(self.case_dir, path)
         where = _read_only_uri(path) if read_only else path.absolute().as_uri()
         self._db = sqlite3.connect(where, timeout=busy_timeout_s, isolation_level=None, uri=True)
         self._db.row_factory = sqlite3.Row
@@ -116,6 +121,12 @@ class Connection:
                 self._db.execute("ROLLBACK")
             raise
 
+    def _next_seq(self) -> int:
+        """The next number in the order of all that happens; call it inside a transaction."""
+        assert self._db.in_transaction
+        row = self._db.execute("UPDATE sequence SET last = last + 1 RETURNING last").fetchone()
+        return int(row[0])
+
     def data_version(self) -> int:
         """A number that changes when another connection has committed something."""
         return int(self._db.execute("PRAGMA data_version").fetchone()[0])
@@ -123,6 +134,17 @@ class Connection:
     def change_count(self) -> tuple[int, int]:
         """As `data_version`, and a number that also changes with what this connection wrote."""
         return self.data_version(), self._db.total_changes
+
+
+def _for_its_owner_alone(case_dir: Path, path: Path) -> None:
+    """Patient data: nobody else may read what is in the folder, or was made by an older program."""
+    with contextlib.suppress(OSError):  # not ours to change, or a disk that takes nothing
+        if case_dir.stat().st_mode & 0o077:
+            case_dir.chmod(0o700)
+        if not path.exists():
+            path.touch(0o600)
+        elif path.stat().st_mode & 0o077:
+            path.chmod(0o600)
 
 
 def _read_only_uri(path: Path) -> str:

@@ -30,8 +30,18 @@ class Events(Connection):
             digest = _event_hash(previous, wall_s, monotonic_s, source, who, kind, text)
             cursor = self._db.execute(
                 "INSERT INTO event (wall_s, monotonic_s, source, who, kind, body, previous_hash,"
-                " hash) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-                (wall_s, monotonic_s, source, who, kind, text, previous, digest),
+                " hash, seq) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                (
+                    wall_s,
+                    monotonic_s,
+                    source,
+                    who,
+                    kind,
+                    text,
+                    previous,
+                    digest,
+                    self._next_seq(),
+                ),
             )
         return int(cursor.lastrowid or 0)
 

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import sqlite3
+import time
 from collections.abc import Mapping
+from typing import Any
 
 from case_record.connection import CaseRecordError, Connection, decoded, json_text
 from case_record.rows import Hold
@@ -23,22 +25,31 @@ class Holds(Connection):
         shift_px: tuple[float, float],
         settled_at_s: float,
         expected_slices: int = 0,
+        bridge: Mapping[str, Any] | None = None,
     ) -> Hold:
-        """The robot stands settled from `settled_at_s` on. There is at most one open hold."""
-        cursor = self._db.execute(
-            "INSERT INTO hold (set_id, place, setpoints_um, readback_um, shift_um, shift_px,"
-            " settled_at_s, expected_slices) VALUES (?, ?, ?, ?, ?, ?, ?, ?)",
-            (
-                set_id,
-                place,
-                json_text(setpoints_um),
-                json_text(readback_um),
-                json_text(shift_um),
-                json_text(list(shift_px)),
-                settled_at_s,
-                expected_slices,
-            ),
-        )
+        """The robot stands settled from `settled_at_s` on. There is at most one open hold.
+
+        bridge: how the robot's bridge stood then, see `service.room.present`.
+        """
+        with self.transaction():
+            cursor = self._db.execute(
+                "INSERT INTO hold (set_id, place, setpoints_um, readback_um, shift_um, shift_px,"
+                " settled_at_s, expected_slices, begun_seq, settled_monotonic_s, bridge)"
+                " VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)",
+                (
+                    set_id,
+                    place,
+                    json_text(setpoints_um),
+                    json_text(readback_um),
+                    json_text(shift_um),
+                    json_text(list(shift_px)),
+                    settled_at_s,
+                    expected_slices,
+                    self._next_seq(),
+                    time.monotonic(),
+                    json_text(bridge or {}),
+                ),
+            )
         return self.hold(int(cursor.lastrowid or 0))
 
     def end_open_hold(self, ended_at_s: float) -> None:
@@ -78,6 +89,6 @@ class Holds(Connection):
 
 
 def _hold(row: sqlite3.Row) -> Hold:
-    values = decoded(row, "setpoints_um", "readback_um", "shift_um", "shift_px")
+    values = decoded(row, "setpoints_um", "readback_um", "shift_um", "shift_px", "bridge")
     values["shift_px"] = tuple(values["shift_px"])
     return Hold(**values)

@@ -17,11 +17,18 @@ class Measurements(Connection):
     def request_measurement(
         self, method: str, hold_ids: Sequence[int], request: Mapping[str, Any]
     ) -> int:
-        cursor = self._db.execute(
-            "INSERT INTO measurement (state, method, hold_ids, request, requested_s)"
-            " VALUES ('requested', ?, ?, ?, ?)",
-            (method, json_text(list(hold_ids)), json_text(request), time.time()),
-        )
+        with self.transaction():
+            cursor = self._db.execute(
+                "INSERT INTO measurement (state, method, hold_ids, request, requested_s,"
+                " requested_seq) VALUES ('requested', ?, ?, ?, ?, ?)",
+                (
+                    method,
+                    json_text(list(hold_ids)),
+                    json_text(request),
+                    time.time(),
+                    self._next_seq(),
+                ),
+            )
         return int(cursor.lastrowid or 0)
 
     def requested_measurements(self) -> list[Measurement]:
@@ -31,18 +38,20 @@ class Measurements(Connection):
         return [_measurement(row) for row in rows]
 
     def finish_measurement(self, measurement_id: int, result: Mapping[str, Any]) -> None:
-        self._db.execute(
-            "UPDATE measurement SET state = 'done', finished_s = ?, result = ?"
-            " WHERE measurement_id = ? AND state = 'requested'",
-            (time.time(), json_text(result), measurement_id),
-        )
+        with self.transaction():
+            self._db.execute(
+                "UPDATE measurement SET state = 'done', finished_s = ?, result = ?,"
+                " finished_seq = ? WHERE measurement_id = ? AND state = 'requested'",
+                (time.time(), json_text(result), self._next_seq(), measurement_id),
+            )
 
     def fail_measurement(self, measurement_id: int, reason_code: str, reason: str) -> None:
-        self._db.execute(
-            "UPDATE measurement SET state = 'failed', finished_s = ?, reason_code = ?, reason = ?"
-            " WHERE measurement_id = ? AND state = 'requested'",
-            (time.time(), reason_code, reason, measurement_id),
-        )
+        with self.transaction():
+            self._db.execute(
+                "UPDATE measurement SET state = 'failed', finished_s = ?, reason_code = ?,"
+                " reason = ?, finished_seq = ? WHERE measurement_id = ? AND state = 'requested'",
+                (time.time(), reason_code, reason, self._next_seq(), measurement_id),
+            )
 
     def measurement(self, measurement_id: int) -> Measurement:
         row = self._db.execute(

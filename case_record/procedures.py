@@ -7,7 +7,7 @@ import time
 from collections.abc import Mapping
 from typing import Any
 
-from case_record.connection import Connection, decoded, json_text
+from case_record.connection import CaseRecordError, Connection, decoded, json_text
 from case_record.rows import Procedure, Step
 
 
@@ -15,17 +15,29 @@ class Procedures(Connection):
     """At most one procedure runs."""
 
     def begin_procedure(self, name: str, arguments: Mapping[str, Any]) -> int:
-        cursor = self._db.execute(
-            "INSERT INTO procedure (name, arguments, state, started_s) VALUES (?, ?, 'running', ?)",
-            (name, json_text(arguments), time.time()),
-        )
+        with self.transaction():
+            cursor = self._db.execute(
+                "INSERT INTO procedure (name, arguments, state, started_s, begun_seq)"
+                " VALUES (?, ?, 'running', ?, ?)",
+                (name, json_text(arguments), time.time(), self._next_seq()),
+            )
         return int(cursor.lastrowid or 0)
 
     def end_procedure(self, procedure_id: int, state: str, result: Mapping[str, Any]) -> None:
-        self._db.execute(
-            "UPDATE procedure SET state = ?, result = ?, ended_s = ? WHERE procedure_id = ?",
-            (state, json_text(result), time.time(), procedure_id),
-        )
+        with self.transaction():
+            self._db.execute(
+                "UPDATE procedure SET state = ?, result = ?, ended_s = ?, ended_seq = ?"
+                " WHERE procedure_id = ?",
+                (state, json_text(result), time.time(), self._next_seq(), procedure_id),
+            )
+
+    def procedure(self, procedure_id: int) -> Procedure:
+        row = self._db.execute(
+            "SELECT * FROM procedure WHERE procedure_id = ?", (procedure_id,)
+        ).fetchone()
+        if row is None:
+            raise CaseRecordError(f"{self.case_dir}: there is no procedure {procedure_id}")
+        return _procedure(row)
 
     def running_procedure(self) -> Procedure | None:
         row = self._db.execute("SELECT * FROM procedure WHERE state = 'running'").fetchone()

@@ -2,6 +2,9 @@
 
 Instants are seconds since the epoch (UTC) on the control room's wall clock unless a name says
 otherwise. Setpoints and readbacks are integer micrometres by axis name. Pixel pairs are (row, col).
+
+Every `seq` is a number in the one order of all that happened in the case: of two of them the larger
+one is later, whatever the clocks say. 0: has not happened.
 """
 
 from __future__ import annotations
@@ -30,11 +33,16 @@ class Event:
     body: Mapping[str, Any]
     previous_hash: str
     hash: str
+    seq: int = 0
 
 
 @dataclass(frozen=True)
 class Hold:
-    """An interval in which the robot stands settled; `ended_at_s` None means: still standing."""
+    """An interval in which the robot stands settled; `ended_at_s` None means: still standing.
+
+    settled_monotonic_s: by the computer's clock that nobody sets; None in records of older
+    programs. bridge: how the robot's bridge stood then.
+    """
 
     hold_id: int
     set_id: int
@@ -46,6 +54,9 @@ class Hold:
     settled_at_s: float
     ended_at_s: float | None
     expected_slices: int
+    begun_seq: int = 0
+    settled_monotonic_s: float | None = None
+    bridge: Mapping[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -72,6 +83,7 @@ class NewSlice:
 @dataclass(frozen=True)
 class SliceRow(NewSlice):
     slice_id: int = 0
+    seq: int = 0
 
 
 @dataclass(frozen=True)
@@ -92,6 +104,8 @@ class Measurement:
     result: Mapping[str, Any] | None
     reason_code: str
     reason: str
+    requested_seq: int = 0
+    finished_seq: int = 0
 
 
 @dataclass(frozen=True)
@@ -103,6 +117,8 @@ class Procedure:
     result: Mapping[str, Any] | None
     started_s: float
     ended_s: float | None
+    begun_seq: int = 0
+    ended_seq: int = 0
 
 
 @dataclass(frozen=True)
@@ -128,3 +144,5 @@ class Move:
     readback_um: Mapping[str, int] = field(default_factory=dict)
     sent_s: float = 0.0
     ended_s: float | None = None
+    sent_seq: int = 0
+    ended_seq: int = 0

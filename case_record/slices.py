@@ -4,9 +4,18 @@ from __future__ import annotations
 
 import sqlite3
 from dataclasses import asdict
+from typing import Any
 
 from case_record.connection import CaseRecordError, Connection, decoded, json_text
 from case_record.rows import NewSlice, SliceRow
+
+_SCAN = (
+    "study_instance_uid",
+    "frame_of_reference_uid",
+    "imaging_frequency_mhz",
+    "pixel_bandwidth_hz",
+    "phase_encoding_direction",
+)
 
 
 class Slices(Connection):
@@ -14,10 +23,10 @@ class Slices(Connection):
 
     def add_slice(self, new: NewSlice) -> SliceRow:
         """Store a slice row. A row with the same UID, frame and bytes is returned unchanged."""
-        values = {**asdict(new), "header": json_text(new.header)}
-        columns = ", ".join(values)
-        marks = ", ".join("?" * len(values))
         with self.transaction():
+            values = {**asdict(new), "header": json_text(new.header), "seq": self._next_seq()}
+            columns = ", ".join(values)
+            marks = ", ".join("?" * len(values))
             self._db.execute(
                 f"INSERT INTO slice ({columns}) VALUES ({marks})"
                 " ON CONFLICT (sop_instance_uid, frame, sha256) DO NOTHING",
@@ -80,6 +89,18 @@ class Slices(Connection):
             (state,) if state else (),
         ).fetchone()
         return _slice(row) if row else None
+
+    def scans_since(self, seq: int) -> list[tuple[str, dict[str, Any]]]:
+        """(state, header) of slices that came later, one of each kind: the header has but study,
+        frame of reference and what shifts oil against water.
+        """
+        parts = ", ".join(f"json_extract(header, '$.{name}') AS {name}" for name in _SCAN)
+        rows = self._db.execute(
+            f"SELECT DISTINCT state, {parts} FROM slice WHERE seq > ?"
+            " AND json_extract(header, '$.study_instance_uid') IS NOT NULL",
+            (seq,),
+        )
+        return [(row["state"], {name: row[name] for name in _SCAN}) for row in rows]
 
     def page_of_slices(
         self, *, after_id: int, limit: int, newest: bool, state: str | None

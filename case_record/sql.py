@@ -115,6 +115,54 @@ MIGRATIONS: tuple[str, ...] = (
         ended_s        REAL
     ) STRICT;
     """,
+    # What came before what: one number that grows with everything that happens, whoever writes it
+    # and whatever the clocks say. What is older than this migration is ordered as its clock had it.
+    """
+    CREATE TABLE sequence (
+        only_one INTEGER PRIMARY KEY CHECK (only_one = 1),
+        last     INTEGER NOT NULL
+    ) STRICT;
+    INSERT INTO sequence
+        SELECT 1, 1000 * (1 + COALESCE(MAX(event_id), 0)) FROM event;
+
+    ALTER TABLE event ADD COLUMN seq INTEGER NOT NULL DEFAULT 0;
+    ALTER TABLE hold ADD COLUMN begun_seq INTEGER NOT NULL DEFAULT 0;
+    ALTER TABLE hold ADD COLUMN settled_monotonic_s REAL;
+    ALTER TABLE hold ADD COLUMN bridge TEXT NOT NULL DEFAULT '{}';
+    ALTER TABLE slice ADD COLUMN seq INTEGER NOT NULL DEFAULT 0;
+    ALTER TABLE measurement ADD COLUMN requested_seq INTEGER NOT NULL DEFAULT 0;
+    ALTER TABLE measurement ADD COLUMN finished_seq INTEGER NOT NULL DEFAULT 0;
+    ALTER TABLE procedure ADD COLUMN begun_seq INTEGER NOT NULL DEFAULT 0;
+    ALTER TABLE procedure ADD COLUMN ended_seq INTEGER NOT NULL DEFAULT 0;
+    ALTER TABLE move ADD COLUMN sent_seq INTEGER NOT NULL DEFAULT 0;
+    ALTER TABLE move ADD COLUMN ended_seq INTEGER NOT NULL DEFAULT 0;
+
+    DROP TRIGGER event_is_never_changed;
+    UPDATE event SET seq = 1000 * event_id;
+    CREATE TRIGGER event_is_never_changed BEFORE UPDATE ON event
+        BEGIN SELECT RAISE(ABORT, 'events are append-only'); END;
+    UPDATE hold SET begun_seq = 1 + 1000 * COALESCE(
+        (SELECT MAX(event_id) FROM event WHERE wall_s <= settled_at_s), 0);
+    UPDATE slice SET seq = 1 + 1000 * COALESCE(
+        (SELECT MAX(event_id) FROM event WHERE wall_s <= received_s), 0);
+    UPDATE measurement SET requested_seq = 2 + 1000 * COALESCE(
+        (SELECT MAX(event_id) FROM event WHERE wall_s <= requested_s), 0);
+    UPDATE measurement SET finished_seq = 3 + 1000 * COALESCE(
+        (SELECT MAX(event_id) FROM event WHERE wall_s <= finished_s), 0)
+        WHERE finished_s IS NOT NULL;
+    UPDATE procedure SET begun_seq = 1 + 1000 * COALESCE(
+        (SELECT MAX(event_id) FROM event WHERE wall_s <= started_s), 0);
+    UPDATE procedure SET ended_seq = 4 + 1000 * COALESCE(
+        (SELECT MAX(event_id) FROM event WHERE wall_s <= ended_s), 0)
+        WHERE ended_s IS NOT NULL;
+    UPDATE move SET sent_seq = 2 + 1000 * COALESCE(
+        (SELECT MAX(event_id) FROM event WHERE wall_s <= sent_s), 0);
+    UPDATE move SET ended_seq = 3 + 1000 * COALESCE(
+        (SELECT MAX(event_id) FROM event WHERE wall_s <= ended_s), 0)
+        WHERE ended_s IS NOT NULL;
+    CREATE INDEX slice_by_seq ON slice (seq);
+    CREATE INDEX event_by_kind ON event (kind, event_id);
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)

@@ -13,11 +13,10 @@ import typer
 from case_record.record import CaseRecordError
 from dicom_listener.check import self_check
 from dicom_listener.process import run
+from room_config.exit_codes import BAD_INPUT, COULD_NOT, DONE
 from room_config.load import ConfigError, load_config
 from room_config.shell import announce, configure_logs, on_parent_gone
 
-BAD_INPUT = 2
-COULD_NOT = 3
 # A slice passes through three threads before it is answered; each must not wait 5 ms (the default)
 # for the one that reads headers.
 _SWITCH_INTERVAL_S = 0.0005
@@ -53,7 +52,7 @@ def listener(
 def _print_check(results: list[tuple[str, bool, str]]) -> int:
     for name, passed, text in results:
         print(f"{'ok  ' if passed else 'FAIL'} {name}: {text}")
-    return 0 if all(passed for _, passed, _ in results) else COULD_NOT
+    return DONE if all(passed for _, passed, _ in results) else COULD_NOT
 
 
 def _stop_event(exit_with_parent: bool) -> threading.Event:

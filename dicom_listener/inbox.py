@@ -118,7 +118,7 @@ class Inbox:
 
 
 def _write_synced(path: Path, *pieces: bytes) -> None:
-    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o640)
+    descriptor = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     try:
         remaining = b"".join(pieces)
         while remaining:
@@ -132,7 +132,7 @@ def _make_durably(folder: Path) -> None:
     """Make a folder and those above it that are missing; their names outlive a power cut."""
     missing = [path for path in (folder, *folder.parents) if not path.is_dir()]
     for path in reversed(missing or [folder]):
-        path.mkdir(exist_ok=True)
+        path.mkdir(exist_ok=True, mode=0o700)
         with contextlib.suppress(PermissionError):  # not ours to open, so not made by us either
             _sync_folder(path.parent)
 

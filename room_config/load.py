@@ -15,6 +15,7 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from room_config.exit_codes import BAD_INPUT
 from room_config.imaging import ImagingConfig
 from room_config.listener import ListenerConfig
 from room_config.openigtlink import OpenIgtLinkConfig
@@ -30,7 +31,7 @@ Model = TypeVar("Model", bound=BaseModel)
 class ConfigError(Exception):
     """The configuration cannot be used; the text is one line that names file and key."""
 
-    exit_code = 2
+    exit_code = BAD_INPUT
 
 
 class Config(BaseModel):

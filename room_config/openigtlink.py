@@ -20,6 +20,11 @@ class OpenIgtLinkConfig(Section):
         description="Addresses or CIDR networks that may connect. OpenIGTLink knows no login: "
         "needed where host is not loopback.",
     )
+    inwards: bool = Field(
+        default=False,
+        description="Answer queries of peers, and put their targets and entry points before the "
+        "operator. STOP and EMERGENCY are heeded from every peer, also where this is off.",
+    )
     max_receivers: int = Field(default=8, ge=1, le=64)
 
     @model_validator(mode="after")

@@ -191,6 +191,12 @@ class ServiceConfig(Section):
     prediction_gate_sigma: float = Field(
         default=5.0, gt=0, description="Refuse to go on when a move misses its prediction by more."
     )
+    ready_valid_s: float = Field(
+        default=300.0,
+        gt=0,
+        description="A measurement, and READY with it, is good for so long: a push of a stage "
+        "without encoder is seen by no sensor. Then it must be measured again.",
+    )
     settle_s: float = Field(
         default=3.5,
         ge=0,

@@ -223,8 +223,30 @@ class RoomClient:
     def choose_target(self, number: int) -> None:
         self._order("POST", f"/api/v1/targets/{number}/choose")
 
+    def take_proposal(self, number: int, *, in_water: bool, label: str = "") -> None:
+        """Make what a planning station proposes the target; in_water: a place in tissue."""
+        path = f"/api/v1/proposals/{number}/take"
+        self._order("POST", path, in_water=in_water, label=label)
+
+    def refuse_proposal(self, number: int, why: str = "") -> None:
+        """Say no to what a planning station proposes; it is told why."""
+        self._order("POST", f"/api/v1/proposals/{number}/refuse", why=why)
+
     def set_entry(self, patient_mm: Sequence[float]) -> None:
         self._order("PUT", "/api/v1/entry", patient_mm=list(patient_mm))
+
+    def change_settings(
+        self, *, strategy: str, tolerance_mm: float, confidence: float, most_slices: int
+    ) -> None:
+        """Of this case, from its next procedure on; `state().belief` says what may be set."""
+        self._order(
+            "PUT",
+            "/api/v1/settings",
+            strategy=strategy,
+            tolerance_mm=tolerance_mm,
+            confidence=confidence,
+            most_slices=most_slices,
+        )
 
     def start_approach(self, *, guide: bool | None = None) -> int:
         """guide: to the line from entry to target; None: as the room is configured."""

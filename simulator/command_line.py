@@ -11,11 +11,10 @@ from typing import Annotated
 
 import typer
 
+from room_config.exit_codes import BAD_INPUT
 from room_config.load import ConfigError, read_toml
 from simulator.config import VirtualRoom, VirtualRoomError, parse_virtual_room
 from simulator.scan_operator import operate, read_token
-
-BAD_INPUT = 2
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 

@@ -12,9 +12,10 @@ from typing import Annotated, Literal
 
 import typer
 
+from room_config.exit_codes import BAD_INPUT
+
 app = typer.Typer(no_args_is_help=True, help="Repeat the paper's experiments, ours beside them.")
 
-BAD_INPUT = 2
 PIPE_WIDTH = 120
 
 

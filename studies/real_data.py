@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from dicom_slice.pixels import magnitude_pixels
 from dicom_slice.reasons import UnusableError
+from room_config.exit_codes import BAD_INPUT
 from sr_engine.detect import detect
 from sr_engine.errors import EngineError
 from studies.accuracy_report import write_report
@@ -66,7 +67,7 @@ def main() -> None:
     options = parser.parse_args()
     if not (options.data / "manifest.csv").is_file():
         print(f"no manifest.csv in {options.data}", file=sys.stderr)
-        raise SystemExit(2)
+        raise SystemExit(BAD_INPUT)
     warnings.simplefilter("ignore", RuntimeWarning)  # medians over methods that all failed
     results = measure(options.data, 4 if options.quick else None)
     options.out.parent.mkdir(parents=True, exist_ok=True)

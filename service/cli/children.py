@@ -9,6 +9,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import shutil
 import signal
 import subprocess
 import threading
@@ -17,13 +18,18 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import IO, Any
 
+from room_config.exit_codes import COULD_NOT
+
+MOST_LOG_BYTES = 16 * 2**20
+LOGS_KEPT = 4
 _TAIL_LINES = 3
+_LAST_WORDS_BYTES = 64 * 1024
 
 
 class ChildError(Exception):
     """A child did not start, or ended; the text is one line with its own last words."""
 
-    exit_code = 3
+    exit_code = COULD_NOT
 
 
 class Child:
@@ -34,7 +40,7 @@ class Child:
         self.log_file = log_file
         self.ready: dict[str, Any] = {}
         self._is_ready = threading.Event()
-        self._log: IO[bytes] = log_file.open("ab")
+        self._log: IO[bytes] = open_log(log_file)
         self._log_start = self._log.tell()
         self.process = subprocess.Popen(
             [*words, "--exit-with-parent"],
@@ -57,7 +63,7 @@ class Child:
                         self.ready = facts
                         self._is_ready.set()
                         continue
-            with contextlib.suppress(ValueError):
+            with contextlib.suppress(ValueError, OSError):
                 self._log.write(line)
 
     def wait_ready(self, timeout_s: float) -> dict[str, Any]:
@@ -82,26 +88,37 @@ class Child:
         return f"{self.name} {how}" + (f": {said}" if said else "")
 
     def _last_words(self) -> str:
-        self._log.flush()
-        with self.log_file.open("rb") as log:
-            log.seek(self._log_start)
-            lines = log.read().decode(errors="replace").splitlines()
+        try:
+            self._log.flush()
+            with self.log_file.open("rb") as log:
+                end = log.seek(0, os.SEEK_END)
+                # what it said itself; the log may have been rotated since
+                start = self._log_start if self._log_start < end else 0
+                log.seek(max(start, end - _LAST_WORDS_BYTES))
+                lines = log.read().decode(errors="replace").splitlines()
+        except OSError:
+            return ""
         plain = [line for line in lines if line.strip() and not line.startswith("{")]
         return " | ".join(plain[-_TAIL_LINES:])
+
+    def ask_to_end(self) -> None:
+        """By signal and by its standard input; returns at once."""
+        with contextlib.suppress(OSError):
+            if self.process.stdin is not None:
+                self.process.stdin.close()
+        with contextlib.suppress(OSError):
+            self.process.terminate()
 
     def end(self, timeout_s: float = 5.0) -> None:
         """Ask the child to end, and kill it if it does not. Idempotent."""
         if self.process.poll() is None:
-            with contextlib.suppress(OSError):
-                if self.process.stdin is not None:
-                    self.process.stdin.close()
-                self.process.terminate()
+            self.ask_to_end()
             try:
                 self.process.wait(timeout_s)
             except subprocess.TimeoutExpired:
                 self.process.kill()
                 self.process.wait()
-        self._reader.join(timeout=1.0)
+        self._reader.join(timeout=0.2)
         for stream in (self.process.stdin, self.process.stdout, self._log):
             if stream is not None:
                 with contextlib.suppress(OSError):
@@ -113,7 +130,8 @@ class Family:
 
     def __init__(self, log_dir: Path) -> None:
         self._log_dir = log_dir
-        log_dir.mkdir(parents=True, exist_ok=True)
+        with contextlib.suppress(OSError):  # of a disk that takes nothing; then nothing is logged
+            log_dir.mkdir(parents=True, exist_ok=True, mode=0o700)
         self.children: dict[str, Child] = {}
 
     def start(self, name: str, words: Sequence[str], timeout_s: float = 120.0) -> dict[str, Any]:
@@ -136,6 +154,47 @@ class Family:
         for name in names or tuple(reversed(self.children)):
             if name in self.children:
                 self.children.pop(name).end()
+
+    def end_all(self, names: Sequence[str], timeout_s: float) -> None:
+        """End the named children at the same time: whoever still runs after timeout_s is killed."""
+        ending = [self.children.pop(name) for name in names if name in self.children]
+        for child in ending:
+            child.ask_to_end()
+        until_s = time.monotonic() + timeout_s
+        for child in ending:
+            child.end(max(0.0, until_s - time.monotonic()))
+
+    def rotate_logs(self) -> None:
+        for child in self.children.values():
+            rotate(child.log_file)
+
+
+def open_log(path: Path) -> IO[bytes]:
+    """To be appended to; where the disk takes no file, what is said is lost and nothing else."""
+    try:
+        return os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o600), "ab")
+    except OSError:
+        return open(os.devnull, "ab")
+
+
+def rotate(path: Path, most_bytes: int = MOST_LOG_BYTES, kept: int = LOGS_KEPT) -> None:
+    """Begin a log anew that has become too long; the last `kept` are kept as NAME.1, NAME.2, ….
+
+    Whoever writes keeps its file: the text is copied away and the file emptied, so that a line
+    which is written in that very moment may be lost.
+    """
+    try:
+        if path.stat().st_size <= most_bytes:
+            return
+        for number in range(kept, 1, -1):
+            older = path.with_name(f"{path.name}.{number - 1}")
+            if older.exists():
+                older.replace(path.with_name(f"{path.name}.{number}"))
+        with contextlib.suppress(OSError):  # a full disk: the log must not grow all the same
+            shutil.copy(path, path.with_name(f"{path.name}.1"))
+        os.truncate(path, 0)
+    except OSError:
+        return
 
 
 def quiet_environment() -> None:

@@ -19,6 +19,7 @@ from typing import Annotated, Any
 import typer
 
 from case_record.record import CaseRecord
+from room_config.exit_codes import BAD_INPUT
 from service.dicom_out.make import FOLDER as OUTPUTS
 from service.room.images import (
     ImageMissingError,
@@ -38,7 +39,7 @@ _SCALE = 3
 class ExportError(ValueError):
     """The case cannot be exported as asked; one line."""
 
-    exit_code = 2
+    exit_code = BAD_INPUT
 
 
 @app.command()

@@ -11,6 +11,7 @@ from dicom_slice.geometry import SliceGeometry
 from dicom_slice.header import Slice
 from dicom_slice.read import dicom_files
 from dicom_slice.reasons import UnusableError
+from room_config.exit_codes import BAD_INPUT
 
 _COLUMNS = ("file", "row_px", "col_px")
 
@@ -18,7 +19,7 @@ _COLUMNS = ("file", "row_px", "col_px")
 class BadFileError(Exception):
     """A file or option cannot be used; the text is one line that names it."""
 
-    exit_code = 2
+    exit_code = BAD_INPUT
 
 
 def files_of(paths: Sequence[Path]) -> list[Path]:

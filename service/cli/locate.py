@@ -18,6 +18,7 @@ from rich.table import Table
 from dicom_slice.header import Slice
 from dicom_slice.read import Frame, read_frames
 from dicom_slice.reasons import UnusableError
+from room_config.exit_codes import COULD_NOT, DONE
 from service.cli.files import BadFileError, files_of, geometry_of, read_shift_table
 from sr_engine.checks import refuse_non_square
 from sr_engine.detect import detect
@@ -26,7 +27,6 @@ from sr_engine.localization import Localization
 from sr_engine.localize import localize
 from sr_engine.locate import Located, locate_all
 
-COULD_NOT = 3
 METHODS = ("ml", "sr", "bicubic", "base")
 app = typer.Typer(add_completion=False)
 
@@ -65,7 +65,7 @@ def locate(
     elif rows:
         # in a pipe there is no width to fit into
         Console(width=None if sys.stdout.isatty() else 140).print(_table(rows))
-    return 0 if rows else COULD_NOT
+    return DONE if rows else COULD_NOT
 
 
 Rows = list[dict[str, Any]]

@@ -12,8 +12,7 @@ import sys
 from collections.abc import Callable, Sequence
 from typing import Any
 
-BAD_INPUT = 2
-COULD_NOT = 3
+from room_config.exit_codes import BAD_INPUT, COULD_NOT, INTERRUPTED
 
 # name: (module:attribute, what it does); an attribute called `main` takes the arguments as a list
 SUBCOMMANDS: dict[str, tuple[str, str]] = {
@@ -41,6 +40,8 @@ SUBCOMMANDS: dict[str, tuple[str, str]] = {
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `autospine`."""
+    # what is written holds patient data: for its owner alone
+    os.umask(0o077)
     words = list(sys.argv[1:] if arguments is None else arguments)
     if not words or words[0] in ("-h", "--help"):
         print(_usage())
@@ -63,7 +64,7 @@ def _run(name: str, words: list[str]) -> int:
             return int(entry(words) or 0)
         return _run_typer(entry, name, words)
     except KeyboardInterrupt:
-        return 130
+        return INTERRUPTED
     except Exception as error:
         if os.environ.get("AUTOSPINE_DEBUG"):
             raise

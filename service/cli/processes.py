@@ -56,8 +56,7 @@ def _serve(room: Config, cases: Cases, exit_with_parent: bool) -> None:
 
     def scene(loop: ControlLoop) -> OpenIgtLinkServer:
         assert followers is not None
-        guide = room.service.guide
-        return OpenIgtLinkServer(room.openigtlink, cases, loop, followers, guide)
+        return OpenIgtLinkServer(room, cases, loop, followers)
 
     failed = threading.Event()
 

@@ -19,6 +19,8 @@ import typer
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, Procedure
 from dicom_slice.reasons import UnusableError
+from room_config.exit_codes import BAD_INPUT, COULD_NOT
+from service.procedure.estimate import axis_sigma
 from service.procedure.registry import build_procedure
 from service.procedure.runner import ReplayMismatchError, same_step
 from service.procedure.sensing import ProcedureFailedError
@@ -36,7 +38,6 @@ from sr_engine.worker import (
 
 app = typer.Typer(add_completion=False)
 METHODS = ("ml", "base", "bicubic", "sr")
-BAD_INPUT, COULD_NOT = 2, 3
 
 
 class ReplayError(ValueError):
@@ -157,7 +158,7 @@ def _replay_one(
         psf = recorded_point_spread(row.result) or psfs.of(taken)
         found = describe_result(taken, localize_request(taken, method, row.request, psf))
         replayed = np.array(found["plane_mm"])
-        sigma = float(np.sqrt(np.trace(np.array(found["covariance_mm2"])) / 2))
+        sigma = axis_sigma(found["covariance_mm2"])
     except (EngineError, UnusableSlicesError, UnusableError) as error:
         reason = " ".join(str(error).split())
     both = recorded is not None and replayed is not None

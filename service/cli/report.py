@@ -19,6 +19,8 @@ from matplotlib.patches import Ellipse
 
 from case_record.record import CaseRecord
 from case_record.rows import Measurement
+from room_config.exit_codes import BAD_INPUT
+from service.procedure.estimate import axis_sigma
 from service.procedure.registry import APPROACHES, CALIBRATIONS
 from service.room.history import known_targets, targets_over_time
 from service.room.images import ImageMissingError, slice_pixels
@@ -38,7 +40,7 @@ th { text-align: left; font-weight: 600 } td.n { text-align: right } img { max-w
 class ReportError(ValueError):
     """The report cannot be written; one line."""
 
-    exit_code = 2
+    exit_code = BAD_INPUT
 
 
 @app.command()
@@ -252,7 +254,7 @@ def _measurements(record: CaseRecord) -> Iterable[str]:
         found = row.result or {}
         sigma = None
         if found:
-            sigma = float(np.sqrt(np.trace(np.array(found["covariance_mm2"])) / 2))
+            sigma = axis_sigma(found["covariance_mm2"])
         place = " ".join(f"{x:.3f}" for x in found.get("patient_mm", ()))
         rows.append(
             (

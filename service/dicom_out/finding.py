@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Event, Measurement, Procedure, SliceRow
 from dicom_slice.geometry import SliceGeometry
-from service.procedure.estimate import probability_within
+from service.procedure.estimate import axis_sigma, probability_within
 from service.procedure.plane import ImagePlane
 from service.procedure.registry import APPROACHES, GUIDE_APPROACH
 from service.room.history import targets_over_time
@@ -179,7 +179,7 @@ def _distance(
     offset = must_be_mm - np.array(result["plane_mm"])
     covariance = np.array(result["covariance_mm2"])
     error_mm = float(np.linalg.norm(offset))
-    sigma_mm = float(np.sqrt(np.trace(covariance) / 2))
+    sigma_mm = axis_sigma(covariance)
     if during is None or during.name == GUIDE_APPROACH:
         return Distance("fiducial", error_mm, sigma_mm)
     tolerance_mm = float(during.arguments["arguments"]["tolerance_mm"])

@@ -36,6 +36,7 @@ from service.dicom_out.identity import (
 )
 from service.dicom_out.image import fine_geometry, has_image, image_of
 from service.dicom_out.source import source_of
+from service.procedure.estimate import axis_sigma
 
 FIDUCIAL = GraphicLayer("FIDUCIAL", 1, "Where the fiducial was measured")
 TARGET = GraphicLayer("TARGET", 2, "Where the fiducial is to be")
@@ -169,7 +170,7 @@ def _arrow(from_px: NDArray[np.float64], to_px: NDArray[np.float64]) -> Iterator
 
 def _words(finding: Finding, drawing: Drawing) -> str:
     place = " ".join(f"{value:.3f}" for value in finding.result["patient_mm"])
-    sigma_um = 1000 * np.sqrt(np.trace(np.array(finding.result["covariance_mm2"])) / 2)
+    sigma_um = 1000 * axis_sigma(finding.result["covariance_mm2"])
     lines = [RESEARCH, f"Fiducial at {place} mm (LPS), standard deviation {sigma_um:.0f} um"]
     distance = finding.distance
     if distance is not None:

@@ -13,6 +13,7 @@ import { addEvent, drawAside, drawCase, drawJog, drawPast, drawTargets } from ".
 import { Live } from "./live.js";
 import { askForToken, leave, whoAmI } from "./login.js";
 import { drawNeedle } from "./needle_view.js";
+import { drawProposals } from "./proposals.js";
 import { drawScannerClock, heardFromRoom } from "./scanner_clock.js";
 import { drawStages } from "./stage_map.js";
 import { drawParts, keepCounting } from "./system_status.js";
@@ -42,6 +43,7 @@ function draw(state) {
   drawNeedle({ guide: state.guide, entry: state.entry_patient_mm, target: state.target_patient_mm, fiducials: belief?.fiducials ?? [], arrival: state.arrival });
   drawStages({ robot: { travel_um: robot.travel_um, positions_um: robot.positions_um, position_certain: robot.position_certain }, plan: question?.plan });
   drawAlarms(state.alarms ?? []);
+  drawProposals({ proposals: state.proposals ?? [], role: page.role });
   drawJog({ positions_um: robot.positions_um, possible: page.role === "operator" && state.jog_possible });
   drawCase({ description: state.case, case_uid: state.case_uid, role: page.role });
   drawScannerClock({ clock: state.clock, role: page.role });
@@ -120,4 +122,19 @@ addEventListener("keydown", (event) => {
   if (event.key === "Escape") pressStop();
 }, { capture: true });
 startHeader();
-begin().catch(() => showLost(0, false));
+
+// Until the service answers for the first time: again and again.
+async function start() {
+  const sinceMs = performance.now();
+  for (;;) {
+    try {
+      await begin();
+      return setHidden(byId("banner-lost"), true);
+    } catch {
+      showLost((performance.now() - sinceMs) / 1000, false);
+      await new Promise((done) => { setTimeout(done, 500); });
+    }
+  }
+}
+
+start();

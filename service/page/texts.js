@@ -158,6 +158,12 @@ export const TEXTS = {
     settings: "Change for this case", mostSlices: "Slices at one position, at most", apply: "Apply", applied: "Applied.",
     bounds: (low, high) => `${low} to ${high}`,
   },
+  proposals: {
+    heading: "Proposed by a planning station", unnamed: "unnamed", from: (sender, via, at) => `from ${sender} by ${via}, ${at}`,
+    target: (where) => `Target ${where} mm (LPS)`, entry: (where) => `Entry point ${where} mm (LPS)`, notYet: (what) => `Not known yet: ${what}.`,
+    noFrame: "The message does not name its frame of reference: compare the position before you accept it.",
+    tissue: "Accept: target in tissue", oil: "Accept: as the fiducial appears", refuse: "Refuse", why: "Why not", whyHint: "reason (optional)",
+  },
   login: { heading: "Log in to AutoSPINe Navigator", token: "Your token", button: "Log in", who: (name, role) => `${name} (${role})`, leave: "Log out" },
   refusal: { noAnswer: "The service does not answer.", status: (status) => `The service answered ${status}.` },
 };

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.procedure.calibration import Calibration
-from service.procedure.estimate import FiducialEstimate, probability_within
+from service.procedure.estimate import FiducialEstimate, axis_sigma, probability_within
 from service.procedure.plan import PlanPart
 from service.procedure.steering import Standing, SteeringArguments, frames_that_decide, steer
 from service.procedure.steps import ProcedureSteps
@@ -136,7 +136,7 @@ def _arrival(fiducial: SteeredFiducial, standing: Standing[Look]) -> Arrival:
     return Arrival(
         standing.calibration,
         float(np.linalg.norm(fiducial.error_mm(estimate))),
-        float(np.sqrt(np.trace(estimate.covariance_mm2) / 2)),
+        axis_sigma(estimate.covariance_mm2),
         fiducial.probability(estimate),
         standing.iterations,
         standing.frames,

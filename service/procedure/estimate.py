@@ -119,3 +119,8 @@ def probability_within(offset_mm: Array, covariance_mm2: Array, tolerance_mm: fl
     inside = ndtr((half_chord - mean[1]) / sigma[1]) - ndtr((-half_chord - mean[1]) / sigma[1])
     total = (last - first) / 2 * float(np.sum(_WEIGHTS * density * half_chord * inside))
     return min(1.0, max(0.0, total))
+
+
+def axis_sigma(covariance: Array | list[list[float]]) -> float:
+    """One figure for a (2, 2) covariance: the root mean square of its standard deviations."""
+    return float(np.sqrt(np.trace(np.asarray(covariance)) / 2))

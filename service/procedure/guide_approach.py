@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.procedure.calibration import Calibration
-from service.procedure.estimate import FiducialEstimate, probability_within
+from service.procedure.estimate import FiducialEstimate, axis_sigma, probability_within
 from service.procedure.guide_geometry import (
     GuideGeometry,
     GuideSeenWrongError,
@@ -72,7 +72,7 @@ class GuideArrival:
             **plain,
             "calibration": self.calibration.to_json(),
             "error_mm": float(np.linalg.norm(self.tip_error_mm)),
-            "sigma_mm": float(np.sqrt(np.trace(self.tip_covariance_mm2) / 2)),
+            "sigma_mm": axis_sigma(self.tip_covariance_mm2),
             "measurement_id": self.calibration.measurement_id,
         }
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from service.procedure.calibration import Calibration
+from service.procedure.estimate import axis_sigma
 from service.procedure.guide_geometry import (
     GuideGeometry,
     GuideSeenWrongError,
@@ -83,7 +84,7 @@ def record_guide(
         line = line_of_state(geometry, estimate.plane_mm, start.plane, arguments.lower_plane_mm)
     except GuideSeenWrongError as wrong:
         raise ProcedureFailedError("guide", str(wrong)) from wrong
-    sigma_mm = float(np.sqrt(np.trace(tip_of(geometry, estimate)[1]) / 2))
+    sigma_mm = axis_sigma(tip_of(geometry, estimate)[1])
     return GuidePlace(calibration, line, geometry.tip_beyond_mm, sigma_mm, look.frames, look.scan_s)
 
 

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from service.procedure.calibration import Calibration
-from service.procedure.estimate import FiducialEstimate
+from service.procedure.estimate import FiducialEstimate, axis_sigma
 from service.procedure.sensing import ValidationGate, check_prediction
 from service.procedure.steps import ProcedureSteps
 from service.procedure.strategies import STRATEGIES, Look, look_at_fiducial, look_longer
@@ -49,7 +49,7 @@ class Place:
         return {
             "calibration": self.calibration.to_json(),
             "measurement_id": self.calibration.measurement_id,
-            "sigma_mm": float(np.sqrt(np.trace(estimate.covariance_mm2) / 2)),
+            "sigma_mm": axis_sigma(estimate.covariance_mm2),
             "frames": self.frames,
             "scan_s": self.scan_s,
         }

@@ -47,13 +47,13 @@ def is_untouched(record: CaseRecord, measurement_id: int) -> bool:
     newest = record.last_measurement("done")
     if newest is not None and newest.measurement_id != measurement_id:
         return False
-    since_s = record.measurement(measurement_id).finished_s
-    if since_s is None:
+    since = record.measurement(measurement_id).requested_seq
+    if not record.measurement(measurement_id).finished_seq:
         return False
     declared = record.last_event(POSITION_DECLARED)
-    if declared is not None and declared.wall_s > since_s:
+    if declared is not None and declared.seq > since:
         return False
-    return all(move.sent_s <= since_s for move in record.moves())
+    return record.last_sent_seq() <= since
 
 
 def positions_to_declare(record: CaseRecord, positions_um: Mapping[str, int]) -> dict[str, int]:
@@ -69,7 +69,7 @@ def positions_to_declare(record: CaseRecord, positions_um: Mapping[str, int]) ->
         return dict(positions_um)
     known = dict(holds[-1].readback_um)
     last = moves[-1] if moves else None
-    if last is not None and last.ended_s is None and last.sent_s > holds[-1].settled_at_s:
+    if last is not None and last.ended_s is None and last.sent_seq > holds[-1].begun_seq:
         if all(setpoint_um == 0 for setpoint_um in last.setpoints_um.values()):
             return dict(positions_um)  # it may well be there
         known = {

@@ -58,6 +58,12 @@ def current_entry(record: CaseRecord) -> tuple[float, float, float] | None:
     return x, y, z
 
 
+def current_entry_number(record: CaseRecord) -> int | None:
+    """The number of the event by which the present entry point was set."""
+    event = record.last_event(ENTRY_SET)
+    return None if event is None else event.event_id
+
+
 def all_targets(record: CaseRecord) -> list[Target]:
     """Every target of the case in the order in which they were set."""
     return [target_of(event) for event in record.events_of_kind(TARGET_SET)]

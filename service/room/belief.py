@@ -1,4 +1,4 @@
-"""What the system believes and why, for a screen: calibration, goal, hold, and what σ is made of."""
+"""What the system believes and why, for a screen: calibration, goal, hold, σ and its parts."""
 
 from __future__ import annotations
 

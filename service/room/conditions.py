@@ -7,6 +7,8 @@ from service.room.alarms import Condition
 from service.room.prompt import plain_words
 from service.room.state import RoomState
 
+HANGS = "does not get on"
+
 
 def conditions(state: RoomState) -> list[Condition]:
     """What is wrong now, most urgent first; each with what to do about it."""
@@ -30,8 +32,12 @@ def conditions(state: RoomState) -> list[Condition]:
     if robot.linked and not robot.position_certain:
         text = "The robot's position is not certain"
         found.append(Condition("position", "warning", text, "Re-arm, then measure."))
+    if state.ready_lost is not None:
+        text = f"READY was lost: {state.ready_lost.text}"
+        what = "Say when the needle is out; then start the approach: it measures again."
+        found.append(Condition("ready_lost", "alarm", text, what))
     for process in state.processes:
-        if process.condition in ("down", "old"):
+        if process.condition == "down" or process.detail == HANGS:
             text = f"The {process.name} {process.detail}"
             found.append(
                 Condition(f"{process.name}_lost", "alarm", text, f"Start the {process.name} again.")

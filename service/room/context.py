@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -16,11 +16,20 @@ from service.procedure.fiducial_plan import gate_of
 from service.procedure.plan import Travel
 from service.procedure.registry import latest_calibration
 from service.procedure.start_point import start_point
+from service.room.case_settings import effective
 from service.room.execution import Execution
 from service.room.link import RoomLink
-from service.room.readiness import ConflictError, may_start
+from service.room.motion_allowed import may_start
+from service.room.present import Now
+from service.room.readiness import ConflictError
+from service.room.stop_latch import StopLatch
 
 SOURCE = "service"
+
+
+def now_of(config: Config, link: RoomLink) -> Now:
+    """How things stand beside the record: the robot, and how long a measurement is good for."""
+    return Now(link.status, config.service.ready_valid_s, link.problem)
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +40,15 @@ class Room:
     record: CaseRecord
     link: RoomLink
     execution: Execution
+    stops: StopLatch = field(default_factory=StopLatch)
+
+    def now(self) -> Now:
+        """How things stand beside the record."""
+        return now_of(self.config, self.link)
+
+    def settings(self) -> Config:
+        """The room's configuration with what was changed for this case."""
+        return effective(self.config, self.record)
 
     def note(self, kind: str, by: str, body: dict[str, Any]) -> None:
         self.record.append_event(kind, body, source=SOURCE, who=by)
@@ -38,7 +56,8 @@ class Room:
     def begin(self, name: str, arguments: dict[str, Any], by: str) -> int:
         with self.record.transaction():
             number = self.record.begin_procedure(name, arguments)
-            self.note(f"{name}_started", by, {"procedure_id": number})
+            body = {"procedure_id": number, **self.execution.permitted_by()}
+            self.note(f"{name}_started", by, body)
         return number
 
     def abort(self, reason: str) -> None:
@@ -53,7 +72,9 @@ class Room:
 
     def check_may_start(self) -> None:
         self.linked()
-        refusal = may_start(self.record, self.link.status)
+        if self.stops.standing:
+            raise ConflictError("not_armed", "STOP was pressed: re-arm the robot first.")
+        refusal = may_start(self.record, self.now())
         if refusal is not None:
             raise refusal
 

@@ -29,13 +29,14 @@ from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steps import Outcome, Step
 from service.procedure.targets import ENTRY_SET, TARGET_SET
 from service.room.alarms import Condition
-from service.room.commands import Commands
+from service.room.commands.commands import Commands
 from service.room.context import Room
 from service.room.describe import Describer, describe_robot
 from service.room.execution import Execution, ProcedureAbortedError
 from service.room.link import RoomLink
 from service.room.readiness import ConflictError
 from service.room.state import RoomState
+from service.room.stop_latch import StopLatch
 from service.room.trouble import RECORD_FAULTS, Trouble, held
 
 _TICK_S = 0.002
@@ -61,18 +62,25 @@ _WHILE_MOVING = frozenset(
         "confirm_acquisition",
         "give_up_slices",
         "set_entry",
+        "propose",
+        "refuse_proposal",
+        "note_registration",
     }
 )
+# the safe direction, and what is only written down: never too late, and not void after a STOP
+_ALWAYS = frozenset({"note_stop", "abort", "lock_motion", "describe_case", "compare_clocks"})
+OLDEST_ORDER_S = 3.0
 log = structlog.get_logger()
 
 
 @dataclass(frozen=True, eq=False)
 class _Asked:
-    """A command of `Commands` by name, and where its answer goes."""
+    """A command of `Commands` by name, when it was asked for (monotonic), where its answer goes."""
 
     name: str
     arguments: dict[str, Any]
     future: Future[Any]
+    asked_s: float
 
 
 class ControlLoop:
@@ -106,6 +114,7 @@ class ControlLoop:
         self._failed_at: tuple[int, str] | None = None
         self._said_s = -_SAID_AGAIN_S
         self._commands: Commands | None = None
+        self._stops = StopLatch()
 
     @property
     def state(self) -> RoomState:
@@ -129,15 +138,17 @@ class ControlLoop:
         self._closing.set()
         self._thread.join(timeout=10.0)
 
-    def call(self, name: str, arguments: Mapping[str, Any]) -> Any:
+    def call(self, name: str, arguments: Mapping[str, Any], asked_s: float | None = None) -> Any:
         """Carry out a command of `Commands` in the loop's thread and return what it returns.
 
-        Raises what the command raises, and TimeoutError if the loop did not come to it; it is then
-        not carried out later either.
+        asked_s: when it was asked for, monotonic clock (default: now). Raises what the command
+        raises, ConflictError if it is too old or STOP was pressed since, and TimeoutError if the
+        loop did not come to it; it is then not carried out later either.
         """
         if self._failure is not None:
             raise ConflictError("control_loop", f"The control loop ended: {self._failure}")
-        asked = _Asked(name, dict(arguments), Future())
+        asked_s = time.monotonic() if asked_s is None else asked_s
+        asked = _Asked(name, dict(arguments), Future(), asked_s)
         self._queue.put(asked)
         try:
             return asked.future.result(timeout=_PATIENCE_S)
@@ -146,10 +157,28 @@ class ControlLoop:
                 raise
             return asked.future.result(timeout=_PATIENCE_S)
 
-    def stop(self, by: str, *, emergency: bool = False) -> None:
-        """Stop the robot now, from any thread; the procedure that runs is aborted."""
+    def stop(self, by: str, *, emergency: bool = False) -> int:
+        """Stop the robot now, from any thread; the procedure that runs is aborted.
+
+        Return the number of this STOP: until `stop_answered` says that whoever pressed it was told
+        what became of it, every order that moves or unlocks is void.
+        """
+        number = self._stops.press()
         self._link.client.request_stop(emergency=emergency)
-        self._queue.put(_Asked(NOTE_STOP, {"by": by, "emergency": emergency}, Future()))
+        arguments = {"by": by, "emergency": emergency}
+        self._queue.put(_Asked(NOTE_STOP, arguments, Future(), time.monotonic()))
+        return number
+
+    def stop_answered(self, number: int) -> None:
+        """See `stop`."""
+        self._stops.answer(number)
+
+    def stop_outcome(self) -> str:
+        """What became of the last STOP: `stopped`, `on_its_way` or `not_delivered` (yet)."""
+        if not self._link.client.stop_acknowledged:
+            return "not_delivered"
+        robot = self._state.robot
+        return "stopped" if robot.linked and robot.stopped and not robot.moving else "on_its_way"
 
     # From here on everything runs in the loop's own thread
 
@@ -184,7 +213,7 @@ class ControlLoop:
         case = record.start_case(self._config.room.name, seed=0)
         self._trouble.settle(record)
         execution = Execution(self._config, record, self._link, self._tick)
-        self._commands = Commands(Room(self._config, record, self._link, execution))
+        self._commands = Commands(Room(self._config, record, self._link, execution, self._stops))
         self._record, self._execution = record, execution
         self._describer = Describer(self._config, record, self._link, self._others_wrong)
         while True:
@@ -237,6 +266,7 @@ class ControlLoop:
         else:
             self._finish_procedure(running, result)
         self._execution.clear()
+        self._keep_ready()  # READY is not shown before motion is locked
         self._publish()
 
     def _fail_by_program(self, running: Procedure, error: Exception) -> None:
@@ -282,10 +312,14 @@ class ControlLoop:
         if self._closing.is_set():
             raise _Closing
         self._answer_queue()
-        if self._publish_if_due() and self._commands is not None:
-            self._commands.keep_lock()
+        if self._publish_if_due():
+            self._keep_ready()
         # last: what the waiting step looks at next is fresh, and screens do not delay a decision
         self._link.pump(_TICK_S)
+
+    def _keep_ready(self) -> None:
+        if self._commands is not None:
+            self._commands.keep_ready()
 
     def _while_moving(self) -> None:
         """Called by the link again and again while it waits for the end of a motion."""
@@ -299,7 +333,7 @@ class ControlLoop:
             except queue.Empty:
                 return
             try:
-                _answer(self._commands, asked, moving, self._publish)
+                self._answer(self._commands, asked, moving)
             except RECORD_FAULTS:
                 if asked.name == NOTE_STOP:
                     self._trouble.owe_stop(**asked.arguments)
@@ -319,6 +353,42 @@ class ControlLoop:
                 asked.future.set_result(None)
             else:
                 asked.future.set_exception(self._trouble.refusal())
+
+    def _answer(self, commands: Commands, asked: _Asked, moving: bool) -> None:
+        """Carry out what was asked; the state that shows it is published before the answer.
+
+        Raises where the record is at fault, after whoever asked was told.
+        """
+        if not asked.future.set_running_or_notify_cancel():
+            return  # whoever asked has given up waiting: not carried out
+        try:
+            self._check(asked, moving)
+            result = commands.carry_out(asked.name, asked.arguments)
+            log.info("command", command=asked.name, by=asked.arguments.get("by"))
+            if not moving:
+                self._keep_ready()
+            self._publish()
+            asked.future.set_result(result)
+        except (ConflictError, CaseRecordError) as error:
+            log.info("refused", command=asked.name, by=asked.arguments.get("by"), why=str(error))
+            asked.future.set_exception(error)
+        except Exception as error:
+            log.exception("command failed", command=asked.name)
+            asked.future.set_exception(error)
+            if isinstance(error, RECORD_FAULTS):
+                raise
+
+    def _check(self, asked: _Asked, moving: bool) -> None:
+        """Raise ConflictError for an order that may not be carried out now, or not any more."""
+        if asked.name not in _ALWAYS and self._stops.voids(asked.asked_s):
+            text = "STOP was pressed after this was asked for: it is not done. Ask again."
+            raise ConflictError("void_after_stop", text)
+        age_s = time.monotonic() - asked.asked_s
+        if asked.name not in _ALWAYS and not age_s <= OLDEST_ORDER_S:
+            text = f"This was asked for {age_s:.1f} s ago: it is not done any more. Ask again."
+            raise ConflictError("stale_order", text)
+        if moving and asked.name not in _WHILE_MOVING:
+            raise ConflictError("moving", "The robot moves: wait until it stands, or press STOP.")
 
     def _publish_if_due(self) -> bool:
         """Publish when something was recorded, and every now and then; whether it was done."""
@@ -357,27 +427,3 @@ class ControlLoop:
 
 class _Closing(Exception):
     """The loop is asked to end; what runs stays as it is recorded."""
-
-
-def _answer(commands: Commands, asked: _Asked, moving: bool, publish: Callable[[], None]) -> None:
-    """Carry out what was asked; the state that shows it is published before the answer is given.
-
-    Raises where the record is at fault, after whoever asked was told.
-    """
-    if not asked.future.set_running_or_notify_cancel():
-        return  # whoever asked has given up waiting: not carried out
-    try:
-        if moving and asked.name not in _WHILE_MOVING:
-            raise ConflictError("moving", "The robot moves: wait until it stands, or press STOP.")
-        result = commands.carry_out(asked.name, asked.arguments)
-        log.info("command", command=asked.name, by=asked.arguments.get("by"))
-        publish()
-        asked.future.set_result(result)
-    except (ConflictError, CaseRecordError) as error:
-        log.info("refused", command=asked.name, by=asked.arguments.get("by"), why=str(error))
-        asked.future.set_exception(error)
-    except Exception as error:
-        log.exception("command failed", command=asked.name)
-        asked.future.set_exception(error)
-        if isinstance(error, RECORD_FAULTS):
-            raise

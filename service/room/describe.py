@@ -13,7 +13,11 @@ from case_record.rows import Measurement, SliceRow
 from room_config.load import Config
 from service.procedure.targets import current_entry, current_target
 from service.room.alarms import AlarmBook, Condition
-from service.room.conditions import conditions
+from service.room.belief import describe_belief
+from service.room.belief_state import BeliefState
+from service.room.case_settings import effective, goal_tolerance_mm
+from service.room.conditions import HANGS, conditions
+from service.room.context import now_of
 from service.room.describe_measurement import (
     describe_error,
     describe_measurement,
@@ -22,14 +26,18 @@ from service.room.describe_measurement import (
 )
 from service.room.execution import Execution
 from service.room.link import RoomLink
+from service.room.motion_allowed import may_start
+from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
 from service.room.prompt import is_calibrated, outcome_text, prompt
-from service.room.readiness import may_start, ready_arrival
+from service.room.proposals import ProposalBook
 from service.room.state import (
     AcquisitionState,
     ArrivalState,
     CaseState,
     ClockState,
     HoldState,
+    LostState,
+    MeasurementState,
     ProcessState,
     QuestionState,
     RobotState,
@@ -38,7 +46,8 @@ from service.room.state import (
 )
 
 PROCESSES = ("listener", "worker")
-_BEAT_IS_OLD_S = 3.0
+_BEAT_IS_OLD_S = 1.0
+_BEAT_IS_LOST_S = 3.0
 _LOOK_EVERY_S = 0.25
 
 
@@ -58,46 +67,55 @@ class Describer:
         self._record = record
         self._link = link
         self._alarms = AlarmBook()
+        self._proposals = ProposalBook()
         self._processes: list[ProcessState] = []
         self._look_at_s = 0.0
         self._around_id = 0
+        self._believed_at = (-1, -1)
 
     def describe(self, execution: Execution, before: RoomState) -> RoomState:
         """Return the present state; the revision grows only if something else than time changed."""
         config, record, link = self._config, self._record, self._link
+        settings = effective(config, record)
         case = record.case()
         target = current_target(record)
         target_mm = list(target.patient_mm) if target else None
         measurement = record.last_measurement()
-        arrival = _arrival(record)
+        now = now_of(config, link)
+        found = readiness(record, now)
+        arrival = _arrival(record, found, now)
         state = before.model_copy(
             update={
                 "at_s": time.time(),
                 "case_uid": case.case_uid if case else "",
                 "case": _case(record),
                 **_procedures(record, execution),
-                "prompt": prompt(config, record, link, execution, arrival is not None),
+                "prompt": prompt(config, record, link, execution, found),
                 "ready": arrival is not None,
+                "ready_lost": _lost_ready(found),
                 "arrival": arrival,
-                "punctured": arrival is not None and _punctured(record, arrival.procedure_id),
+                "punctured": found is not None and _punctured(record, found.procedure_id),
                 "robot": describe_robot(link, before.robot),
-                "jog_possible": may_start(record, link.status) is None,
+                "jog_possible": may_start(record, now) is None,
                 "hold": _hold(record),
                 **_slices(record),
-                "measurement": None if measurement is None else describe_measurement(measurement),
+                "measurement": _measurement(record, measurement, now),
                 **self._around(measurement, before),
                 "clock": _clock(config, record),
                 "calibrated": is_calibrated(config, record),
                 "target_patient_mm": tuple(target_mm) if target_mm else None,
                 "entry_patient_mm": current_entry(record),
-                "error": describe_error(config, record, target_mm),
+                **_error(settings, record, target_mm, now),
                 "event_id": record.last_event_id(),
                 "processes": self._look_at_processes(),
+                "proposals": self._proposals.update(record),
+                "tolerance_mm": goal_tolerance_mm(settings),
+                "belief": self._believed(before),
             }
         )
         alarms = self._alarms.update([*conditions(state), *self._others_wrong()], record)
         state = state.model_copy(update={"alarms": alarms})
-        same = state.model_copy(update={"at_s": before.at_s}) == before
+        same = _timeless(state) == _timeless(before)
         return state.model_copy(update={"revision": before.revision + (not same)})
 
     def _around(self, last: Measurement | None, before: RoomState) -> dict[str, Any]:
@@ -109,6 +127,14 @@ class Describer:
             "reconstruction": describe_reconstruction(self._record, before.reconstruction, last),
             "other_fiducial": describe_other_fiducial(self._record, last),
         }
+
+    def _believed(self, before: RoomState) -> BeliefState:
+        """What the system believes; worked out anew when the record has changed."""
+        changes = self._record.change_count()
+        if before.belief is not None and changes == self._believed_at:
+            return before.belief
+        self._believed_at = changes
+        return describe_belief(self._config, self._record)
 
     def _look_at_processes(self) -> list[ProcessState]:
         if time.monotonic() >= self._look_at_s:
@@ -125,8 +151,10 @@ def _condition(seen: bool, running: bool, beat_age_s: float) -> dict[str, str]:
         return {"condition": "none", "detail": "has not run on this case yet"}
     if not running:
         return {"condition": "down", "detail": "has ended"}
+    if beat_age_s > _BEAT_IS_LOST_S:
+        return {"condition": "old", "detail": HANGS}
     if beat_age_s > _BEAT_IS_OLD_S:
-        return {"condition": "old", "detail": "does not get on"}
+        return {"condition": "old", "detail": "is quiet"}
     return {"condition": "up", "detail": ""}
 
 
@@ -205,14 +233,57 @@ def _slice(row: SliceRow) -> SliceState | None:
     )
 
 
-def _arrival(record: CaseRecord) -> ArrivalState | None:
-    """Of the approach whose target the needle guide is at."""
-    arrival = ready_arrival(record)
-    if arrival is None:
+def _arrival(record: CaseRecord, found: Readiness | None, now: Now) -> ArrivalState | None:
+    """Of the approach whose target the needle guide is at now."""
+    if found is None or not found.ready:
         return None
-    procedure_id, result = arrival
+    result = found.arrival
     known = {name: result[name] for name in ArrivalState.model_fields if name in result}
-    return ArrivalState(procedure_id=procedure_id, **known)
+    measurement = record.measurement(int(result["measurement_id"]))
+    age = age_s(measurement.request[RESTS_ON], now)
+    return ArrivalState(procedure_id=found.procedure_id, **{**known, "age_s": age})
+
+
+def _lost_ready(found: Readiness | None) -> LostState | None:
+    if found is None or found.lost is None:
+        return None
+    return LostState(code=found.lost.code, text=found.lost.text)
+
+
+def _measurement(record: CaseRecord, last: Measurement | None, now: Now) -> MeasurementState | None:
+    if last is None:
+        return None
+    facts = last.request.get(RESTS_ON)
+    lost = why_not_now(record, last, now) if last.state == "done" else None
+    update = {
+        "lost": None if lost is None else LostState(code=lost.code, text=lost.text),
+        "age_s": None if facts is None else age_s(facts, now),
+    }
+    return describe_measurement(last).model_copy(update=update)
+
+
+def _error(
+    config: Config, record: CaseRecord, target_mm: list[float] | None, now: Now
+) -> dict[str, Any]:
+    """How far off it is now; if that is not known, why not."""
+    last = record.last_measurement("done")
+    if last is None:
+        return {"error": None, "error_reason": "nothing was measured yet"}
+    if target_mm is None:
+        return {"error": None, "error_reason": "no target is set"}
+    lost = why_not_now(record, last, now)
+    if lost is not None:
+        return {"error": None, "error_reason": lost.text}
+    error = describe_error(config, record, target_mm)
+    return {"error": error, "error_reason": "" if error else "not calibrated"}
+
+
+def _timeless(state: RoomState) -> RoomState:
+    """The state without what changes by time alone."""
+    ageless = {"age_s": None}
+    parts = {name: getattr(state, name) for name in ("measurement", "arrival")}
+    younger = {name: part and part.model_copy(update=ageless) for name, part in parts.items()}
+    return state.model_copy(update={"at_s": 0.0, "revision": 0, **younger})
 
 
 def _punctured(record: CaseRecord, procedure_id: int) -> bool:

@@ -11,7 +11,7 @@ from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
 from dicom_slice.geometry import SliceGeometry
 from room_config.load import Config
-from service.procedure.estimate import probability_within
+from service.procedure.estimate import axis_sigma, probability_within
 from service.procedure.registry import latest_calibration
 from service.room.state import ErrorState, FiducialState, MeasurementState, ReconstructionState
 
@@ -37,6 +37,7 @@ def describe_measurement(last: Measurement) -> MeasurementState:
         patient_mm=found.get("patient_mm"),
         n_frames=found.get("n_frames", 0),
         snr=found.get("snr"),
+        chi2_per_dof=found.get("chi2_per_dof"),
         has_reconstruction=bool(found.get("reconstruction")),
     )
 
@@ -120,7 +121,7 @@ def describe_error(
         row_mm=float(offset[0]),
         col_mm=float(offset[1]),
         error_mm=float(np.linalg.norm(offset)),
-        sigma_mm=float(np.sqrt(np.trace(covariance) / 2)),
+        sigma_mm=axis_sigma(covariance),
         probability_within_tolerance=probability_within(
             offset, covariance, config.service.tolerance_mm
         ),

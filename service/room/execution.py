@@ -9,12 +9,14 @@ from typing import Any
 
 from case_record.record import CaseRecord
 from case_record.rows import Hold
-from robot_bridge.client.client import LinkLostError, MoveOutcome, RefusedError
-from robot_bridge.protocol.messages import CommandState
+from robot_bridge.client.client import BridgeStatus, LinkLostError, MoveOutcome, RefusedError
+from robot_bridge.protocol.messages import Code, CommandState
 from robot_bridge.protocol.phases import WorkPhase, motion_allowed
 from room_config.load import Config
 from service.procedure.plan import PLAN_VOID, why_void
 from service.procedure.runner import measurement_name
+from service.procedure.sensing import ABORT
+from service.procedure.steering import CONFIRM
 from service.procedure.steps import (
     Acquire,
     Acquired,
@@ -27,17 +29,26 @@ from service.procedure.steps import (
     Outcome,
     Step,
 )
+from service.room.going_on import GO_ON, Permitted
 from service.room.link import RoomLink
 from service.room.measuring import measure_request, measured_from_result
+from service.room.present import RESTS_ON, bridge_facts, rests_on, why_stood_no_more
 from sr_engine.worker import is_at_position
 
 _SERVICE = "service"
+_STOPPED_BY_PEOPLE = frozenset({Code.OPERATOR_STOP.value, Code.EMERGENCY_STOP.value})
 
 
 def _phase_of(purpose: str) -> WorkPhase:
     if "calib" in purpose:
         return WorkPhase.CALIBRATION
     return WorkPhase.MANUAL if purpose == "manual" else WorkPhase.MOVE_TO_TARGET
+
+
+def _stands_at(hold: Hold, status: BridgeStatus) -> bool:
+    """Whether the robot has stood at the hold ever since it began."""
+    undisturbed = bool(hold.bridge) and why_stood_no_more(hold.bridge, status) is None
+    return undisturbed and hold.readback_um == dict(status.positions_um)
 
 
 class ProcedureAbortedError(Exception):
@@ -76,6 +87,7 @@ class Execution:
         self._tick = tick
         self._answer: Answered | None = None
         self._abort: str | None = None
+        self._permitted = Permitted(record)
         self.request: AcquisitionRequest | None = None
         self.question: Question | None = None
         self.prompt = ""
@@ -83,6 +95,7 @@ class Execution:
     def execute(self, step: Step, command_id: str) -> Outcome:
         """Carry out a step; raises ProcedureAbortedError when the operator or STOP ends it."""
         self._check_abort()
+        self._permitted.recall()
         if isinstance(step, MoveTo):
             return self._move(step, command_id)
         if isinstance(step, Acquire):
@@ -107,6 +120,12 @@ class Execution:
     def clear(self) -> None:
         self._answer = self._abort = self.request = self.question = None
         self.prompt = ""
+        self._permitted.forget()
+
+    def permitted_by(self) -> dict[str, Any]:
+        """How the bridge stands as somebody orders a procedure: only then it may move by it."""
+        status = self._link.status
+        return {} if status is None else self._permitted.facts(status)
 
     # Moves
 
@@ -117,7 +136,7 @@ class Execution:
         if step.rests_on is not None:
             measurement = measurement_name(case_uid, step.rests_on)
         while True:
-            self._wait_until_ready_to_move()
+            self._wait_until_ready_to_move(step, command_id)
             void = self._why_void(step, command_id)
             if void:
                 return self._refuse(void)
@@ -141,6 +160,7 @@ class Execution:
                 outcome = self._link.client.move(command_id, step.setpoints_um, measurement)
             except LinkLostError as error:
                 self._link.lost(error)
+                self._permitted.interrupt()
                 continue  # asked again under the same id: the bridge's journal answers
             except RefusedError as error:
                 outcome = MoveOutcome(command_id, CommandState.REFUSED, error.code, error.text, {})
@@ -201,9 +221,14 @@ class Execution:
             shift_um=step.shift_um if step else {},
             shift_px=step.shift_px if step else (0.0, 0.0),
             settled_at_s=settled_at_s,
+            bridge=None if self._link.status is None else bridge_facts(self._link.status),
         )
 
-    def _wait_until_ready_to_move(self) -> None:
+    def _wait_until_ready_to_move(self, step: MoveTo, command_id: str) -> None:
+        """Until the robot may move, and by an order that was given as it stands now.
+
+        A robot that was stopped, disarmed or lost since moves only when somebody says: go on.
+        """
         while True:
             status = self._link.status
             if status is None:
@@ -211,12 +236,34 @@ class Execution:
             elif status.moving:
                 self.prompt = "The robot is coming to rest."
             elif status.stopped or not status.armed:
+                self._permitted.interrupt()
                 self.prompt = "Re-arm the robot to go on."
             elif not status.position_certain:
+                self._permitted.interrupt()
                 self.prompt = "The robot was restarted: check it, then re-arm to go on."
-            else:
+            elif self._permitted.covers(status):
                 return
+            else:
+                self._ask_to_go_on(step, command_id, status)
+                continue
             self._wait()
+
+    def _ask_to_go_on(self, step: MoveTo, command_id: str, status: BridgeStatus) -> None:
+        """Raises ProcedureAbortedError unless the answer is to go on."""
+        ways = ", ".join(
+            f"{axis} {status.positions_um[axis] / 1000:.3f} → {to_um / 1000:.3f} mm"
+            for axis, to_um in step.setpoints_um.items()
+            if status.positions_um.get(axis, to_um) != to_um
+        )
+        question = f"The robot was interrupted. Go on ({step.purpose}: {ways or 'no motion'})?"
+        answer = self._ask(
+            AskOperator(question, (GO_ON, ABORT)), f"{command_id}/go-on.{status.stop_count}"
+        )
+        if answer.choice != GO_ON:
+            raise ProcedureAbortedError(f"ended by {answer.who} after an interruption")
+        self._permitted.give(self._link.status or status)
+        body = {"command_id": command_id, **self._permitted.facts(self._link.status or status)}
+        self._record.append_event("went_on", body, source=_SERVICE, who=answer.who)
 
     # Slices and measurements
 
@@ -279,8 +326,7 @@ class Execution:
             hold = self._record.open_hold()
             status = self._link.status
             if status is not None and not status.moving and status.position_certain:
-                stands = hold is not None and hold.readback_um == dict(status.positions_um)
-                if hold is not None and stands and not fresh:
+                if hold is not None and not fresh and _stands_at(hold, status):
                     return hold
                 with self._record.transaction():
                     self._record.end_open_hold(time.time())
@@ -293,13 +339,39 @@ class Execution:
         radius_mm = (imaging.fiducial_radius_min_mm, imaging.fiducial_radius_max_mm)
         hold_ids = [h.hold_id for h in step.holds]
         request = measure_request(step, radius_mm, imaging.start_region_px)
+        status = self._linked()
+        request[RESTS_ON] = rests_on(self._record, status)
         number = self._record.request_measurement(step.method, hold_ids, request)
+        if disturbed := self._disturbed(hold_ids, status):
+            self._record.fail_measurement(number, "disturbed", disturbed)
         self.prompt = "Localizing the fiducial."
         while (measurement := self._record.measurement(number)).state == "requested":
             self._wait()
         if measurement.state == "failed" or measurement.result is None:
             return Measured(number, measurement.reason_code or "failed", measurement.reason)
         return measured_from_result(number, measurement.result)
+
+    def _linked(self) -> BridgeStatus:
+        """The bridge's status; waits for the link, for what is measured is of a robot that stands
+        somewhere.
+        """
+        while (status := self._link.status) is None:
+            self.prompt = f"No link to the robot: {self._link.problem}"
+            self._wait()
+        return status
+
+    def _disturbed(self, hold_ids: list[int], status: BridgeStatus) -> str:
+        """What happened to the robot while its slices were taken; empty if nothing did."""
+        for hold in map(self._record.hold, hold_ids):
+            known = dict(hold.bridge)
+            if not known:
+                return "it is not known how the robot stood at the hold"
+            if hold.ended_at_s is not None:  # it moved on, as commanded, to the next place
+                known["last_motion"] = status.last_motion
+            lost = why_stood_no_more(known, status)
+            if lost is not None:
+                return f"the slices count no more: {lost.text}"
+        return ""
 
     # The operator
 
@@ -310,11 +382,16 @@ class Execution:
         while self._answer is None:
             self._wait()
         self.question = None
+        if self._answer.choice == CONFIRM and self._link.status is not None:
+            self._permitted.give(self._link.status)
         return self._answer
 
     def _wait(self) -> None:
         self._tick()
         self._check_abort()
+        status = self._link.status
+        if status is not None and status.stopped and status.stop_reason in _STOPPED_BY_PEOPLE:
+            raise ProcedureAbortedError(f"STOP ({status.stop_reason.replace('_', ' ')})")
 
     def _check_abort(self) -> None:
         if self._abort is not None:

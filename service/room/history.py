@@ -11,6 +11,7 @@ import numpy as np
 from case_record.cases import Cases
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Measurement
+from service.procedure.estimate import axis_sigma
 from service.procedure.plane import ImagePlane
 from service.procedure.registry import APPROACHES
 from service.procedure.targets import TARGET_SET, TARGET_WITHDRAWN, current_target, target_of
@@ -59,7 +60,7 @@ class Targets:
 
 
 def _sigma_mm(covariance_mm2: list[list[float]]) -> float:
-    return float(np.sqrt(np.trace(np.array(covariance_mm2)) / 2))
+    return axis_sigma(covariance_mm2)
 
 
 def known_targets(record: CaseRecord) -> list[KnownTarget]:

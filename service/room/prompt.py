@@ -12,24 +12,33 @@ from service.procedure.registry import CALIBRATION, GUIDE_CALIBRATION
 from service.procedure.targets import current_entry, current_target
 from service.room.execution import Execution
 from service.room.link import RoomLink
+from service.room.present import Readiness
 
 
 def prompt(
-    config: Config, record: CaseRecord, link: RoomLink, execution: Execution, ready: bool
+    config: Config,
+    record: CaseRecord,
+    link: RoomLink,
+    execution: Execution,
+    found: Readiness | None,
 ) -> str:
-    """What is to be done next; ready: the needle guide is at its target."""
+    """What is to be done next; found: how it stands with READY."""
     if link.status is None:
         return f"No link to the robot: {link.problem}"
-    return execution.prompt or _idle_prompt(config, record, link.status, ready)
+    return execution.prompt or _idle_prompt(config, record, link.status, found)
 
 
-def _idle_prompt(config: Config, record: CaseRecord, status: BridgeStatus, ready: bool) -> str:
-    if ready:
+def _idle_prompt(
+    config: Config, record: CaseRecord, status: BridgeStatus, found: Readiness | None
+) -> str:
+    if found is not None and found.ready:
         return "READY: puncture; then say when the needle is out."
     if status.phase is WorkPhase.EMERGENCY:
         return "EMERGENCY: the drives are parked. See to patient and needle; then re-arm."
     if status.stopped:
         return f"Stopped ({plain_words(status.stop_reason)}). Re-arm to go on."
+    if found is not None:
+        return _after_arrival(found, status)
     if not status.armed:
         return "Arm the robot."
     if not is_calibrated(config, record):
@@ -39,6 +48,14 @@ def _idle_prompt(config: Config, record: CaseRecord, status: BridgeStatus, ready
     if config.service.guide is not None and current_entry(record) is None:
         return "Set an entry point."
     return "Start the approach, or set another target."
+
+
+def _after_arrival(found: Readiness, status: BridgeStatus) -> str:
+    """The guide came to its target, but READY cannot be said, or not any more."""
+    if found.lost is None:
+        return "Motion is being locked for the needle."
+    first = "Say first when the needle is out. " if status.insertion_locked else ""
+    return f"READY was lost: measure again. {first}({found.lost.text})"
 
 
 def is_calibrated(config: Config, record: CaseRecord) -> bool:

@@ -1,11 +1,10 @@
-"""What stands in the way of an order: nothing starts while the needle may be in, and so on."""
+"""Why an order is refused, and which approach came to its end and waits for the needle."""
 
 from __future__ import annotations
 
 from typing import Any
 
 from case_record.record import CaseRecord
-from robot_bridge.client.client import BridgeStatus
 from service.procedure.registry import APPROACHES
 
 
@@ -17,21 +16,12 @@ class ConflictError(Exception):
         self.code = code
 
 
-def may_start(record: CaseRecord, status: BridgeStatus | None) -> ConflictError | None:
-    """Why the robot may not begin to move now, or None."""
-    if status is None:
-        return ConflictError("no_link", "No link to the robot.")
-    if record.running_procedure() is not None:
-        return ConflictError("busy", "A procedure is running: wait for its end or abort it.")
-    if ready_arrival(record) is not None or status.insertion_locked:
-        return ConflictError("insertion_locked", "Motion is locked until the needle is out.")
-    if status.stopped or not status.armed:
-        return ConflictError("not_armed", "Re-arm the robot first.")
-    return None
-
-
 def ready_arrival(record: CaseRecord) -> tuple[int, dict[str, Any]] | None:
-    """The approach (id and result) whose target the needle guide is at, until the needle is out."""
+    """The approach (id and result) that came to its end last, until the needle is out.
+
+    What came first is said by the record's order. Whether the guide is at the target still is
+    another question: `service.room.present.readiness`.
+    """
     done = [record.last_procedure(name, "done") for name in APPROACHES]
     arrival = max((row for row in done if row), key=lambda row: row.procedure_id, default=None)
     if arrival is None or arrival.result is None or arrival.ended_s is None:
@@ -39,6 +29,6 @@ def ready_arrival(record: CaseRecord) -> tuple[int, dict[str, Any]] | None:
     if record.running_procedure() is not None:
         return None
     out = record.last_event("needle_out")
-    if out is not None and out.wall_s > arrival.ended_s:
+    if out is not None and out.seq > arrival.ended_seq:
         return None
     return arrival.procedure_id, dict(arrival.result)

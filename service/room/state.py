@@ -9,6 +9,8 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from room_config.load import Config
+from service.room.belief_state import BeliefState
+from service.room.proposals import ProposalState
 
 
 class _Frozen(BaseModel):
@@ -49,8 +51,18 @@ class QuestionState(_Frozen):
     plan: dict[str, Any] | None
 
 
+class LostState(_Frozen):
+    """Why something does not hold any more: `code` for programs, `text` for people."""
+
+    code: str
+    text: str
+
+
 class MeasurementState(_Frozen):
-    """The newest finished measurement: positions in the slice and in the patient."""
+    """The newest finished measurement: positions in the slice and in the patient.
+
+    lost: why it does not say any more where the fiducial is; age_s: since it was asked for.
+    """
 
     measurement_id: int
     method: str
@@ -66,7 +78,10 @@ class MeasurementState(_Frozen):
     patient_mm: tuple[float, float, float] | None = None
     n_frames: int = 0
     snr: float | None = None
+    chi2_per_dof: float | None = None
     has_reconstruction: bool = False
+    age_s: float | None = None
+    lost: LostState | None = None
 
 
 class FiducialState(_Frozen):
@@ -98,7 +113,7 @@ class ErrorState(_Frozen):
 
 
 class ArrivalState(_Frozen):
-    """READY: how the needle guide came to the target, and how sure that is.
+    """READY: how the needle guide came to the target, and how sure that is; only while it holds.
 
     With two fiducials the error is that of the needle's tip, and the last fields say where it is:
     (row, col) in the image plane, depth below the lower ball joint, both points in patient LPS mm.
@@ -117,6 +132,7 @@ class ArrivalState(_Frozen):
     tip_below_joint_mm: float | None = None
     tip_mm: tuple[float, float, float] | None = None
     joint_mm: tuple[float, float, float] | None = None
+    age_s: float | None = None
 
 
 class SliceState(_Frozen):
@@ -195,6 +211,8 @@ class RoomState(_Frozen):
     last_outcome: str = ""
     prompt: str = ""
     ready: bool = False
+    ready_lost: LostState | None = None
+    ready_valid_s: float
     arrival: ArrivalState | None = None
     robot: RobotState = RobotState()
     acquisition_request: AcquisitionState | None = None
@@ -207,6 +225,7 @@ class RoomState(_Frozen):
     guide: bool = False
     target_patient_mm: tuple[float, float, float] | None = None
     error: ErrorState | None = None
+    error_reason: str = ""
     tolerance_mm: float
     event_id: int = 0
     service_id: str = ""
@@ -222,6 +241,8 @@ class RoomState(_Frozen):
     arrival_mode: bool = False
     processes: list[ProcessState] = []
     alarms: list[AlarmState] = []
+    belief: BeliefState | None = None
+    proposals: list[ProposalState] = []
 
     @classmethod
     def initial(cls, config: Config) -> RoomState:
@@ -233,5 +254,6 @@ class RoomState(_Frozen):
             virtual=config.room.virtual,
             arrival_mode=config.listener.arrival_mode,
             guide=config.service.guide is not None,
+            ready_valid_s=config.service.ready_valid_s,
             tolerance_mm=(config.service.guide or config.service).tolerance_mm,
         )

@@ -15,7 +15,7 @@ from typing import Any
 from case_record.record import CaseRecord
 from service.room.alarms import Condition
 from service.room.readiness import ConflictError
-from service.room.state import AlarmState, RobotState, RoomState
+from service.room.state import AlarmState, LostState, MeasurementState, RobotState, RoomState
 
 RECORD_FAULTS = (sqlite3.Error, OSError)
 _SOURCE = "service"
@@ -78,6 +78,12 @@ class Trouble:
         return Condition("record_unusable", "alarm", text, what)
 
 
+def _not_known(before: MeasurementState | None, wrong: Condition) -> MeasurementState | None:
+    """Whether what was measured still holds cannot be looked up."""
+    lost = LostState(code=wrong.code, text=wrong.text)
+    return None if before is None else before.model_copy(update={"lost": lost, "age_s": None})
+
+
 def held(before: RoomState, robot: RobotState, wrong: Condition, since_s: float) -> RoomState:
     """The state while the rest of it is not known: nothing in it says READY or asks for anything.
 
@@ -96,6 +102,8 @@ def held(before: RoomState, robot: RobotState, wrong: Condition, since_s: float)
             "acquisition_request": None,
             "question": None,
             "error": None,
+            "error_reason": wrong.text,
+            "measurement": _not_known(before.measurement, wrong),
             "alarms": [alarm, *others],
         }
     )

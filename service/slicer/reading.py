@@ -66,11 +66,26 @@ class Stream:
     def __init__(self) -> None:
         self._waiting = bytearray()
         self._skip = 0
+        self._lost = False
         self.faults: Counter[str] = Counter()
 
     def feed(self, data: bytes) -> list[Received]:
         """Take bytes; return the messages that are whole by now, in their order."""
         self._waiting += data
+        return list(self._messages())
+
+    @property
+    def is_waiting(self) -> bool:
+        """Whether the rest of a message is awaited."""
+        return bool(self._waiting or self._skip)
+
+    def give_up(self) -> list[Received]:
+        """The rest of a message does not come: look for whole ones behind its start."""
+        self._skip = 0
+        if len(self._waiting) < HEADER.size:
+            self._waiting.clear()
+            return []
+        self._find_header("cut off")
         return list(self._messages())
 
     def _messages(self) -> Iterator[Received]:
@@ -83,8 +98,7 @@ class Stream:
                 return
             version, kind, device, _, size, crc = HEADER.unpack_from(self._waiting)
             if not _is_plausible(version, kind, size):
-                self.faults["no header"] += 1
-                self._find_header()
+                self._find_header("no header")
                 continue
             if size > LARGEST_BODY or version not in _VERSIONS:
                 self.faults["too large" if size > LARGEST_BODY else "version"] += 1
@@ -95,27 +109,33 @@ class Stream:
             body = bytes(self._waiting[HEADER.size : HEADER.size + size])
             if crc64(body) != crc:
                 # its length may be what is wrong: what follows is looked for inside of it too
-                self.faults["crc"] += 1
-                self._find_header()
+                self._find_header("crc")
                 continue
             del self._waiting[: HEADER.size + size]
+            self._lost = False
             try:
                 yield _received(version, _text(kind), _text(device), body)
             except MessageError:
                 self.faults["meta-data"] += 1
 
-    def _find_header(self) -> None:
-        """Drop what stands before the next thing that could be a header."""
-        for match in _TYPE.finditer(self._waiting, 3):
-            start = match.start() - 2
-            if len(self._waiting) < start + HEADER.size:
-                del self._waiting[:start]
-                return
-            version, kind, _, _, size, _ = HEADER.unpack_from(self._waiting, start)
-            if _is_plausible(version, kind, size):
-                del self._waiting[:start]
-                return
-        del self._waiting[: max(1, len(self._waiting) - HEADER.size + 1)]
+    def _find_header(self, fault: str) -> None:
+        """Drop what stands before the next thing that could be a header; one fault until then."""
+        if not self._lost:
+            self.faults[fault] += 1
+            self._lost = True
+        del self._waiting[: _next_header(bytes(self._waiting))]
+
+
+def _next_header(waiting: bytes) -> int:
+    """Where behind the start of this the next header begins, or could."""
+    for match in _TYPE.finditer(waiting, 3):
+        start = match.start() - 2
+        if len(waiting) < start + HEADER.size:
+            return start
+        version, kind, _, _, size, _ = HEADER.unpack_from(waiting, start)
+        if _is_plausible(version, kind, size):
+            return start
+    return max(1, len(waiting) - HEADER.size + 1)
 
 
 def _is_plausible(version: int, kind: bytes, size: int) -> bool:

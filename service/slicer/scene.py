@@ -96,13 +96,12 @@ def scene_of(state: RoomState, guide: GuideConfig | None = None) -> Scene:
     }
 
 
-def stale_scene(state: RoomState) -> Scene:
-    """Only that nobody knows what the room does now; its needle guide is nowhere known."""
+def stale(state: RoomState) -> RoomState:
+    """A state that is old: nobody knows what the room does now, and where its guide is."""
     text = "The control loop does not say what the room is doing."
-    return {
-        "AutoSPINe": status("AutoSPINe", state.at_s, STATUS_NOT_READY, "STALE", text),
-        "NeedleGuide": _needle(state.at_s, None),
-    }
+    robot = state.robot.model_copy(update={"linked": False, "problem": text, "phase": "STALE"})
+    change = {"robot": robot, "ready": False, "procedure": None, "prompt": text}
+    return state.model_copy(update=change)
 
 
 class Images:

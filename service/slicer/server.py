@@ -1,9 +1,9 @@
-"""Serves the room's scene over OpenIGTLink: any number of receivers, nothing is taken from them.
+"""Serves the room's scene over OpenIGTLink, and hears what peers say.
 
-Runs in the service's event loop. While nobody is connected nothing is done. Receivers get the
-whole scene when they connect and then what has changed; one that is slow misses what was replaced
-in the meantime, one that takes nothing for seconds is let go. There is no login in the protocol:
-who may connect is told by address.
+Runs in the service's event loop. While nobody is connected nothing is done. Peers get the whole
+scene when they connect and then what has changed; one that is slow misses what was replaced in the
+meantime, one that takes nothing for seconds is let go. There is no login in the protocol: who may
+connect is told by address, and what a peer may ask for stands in `answers`.
 """
 
 from __future__ import annotations
@@ -12,24 +12,26 @@ import asyncio
 import contextlib
 import ipaddress
 import socket
+from collections import Counter
+from collections.abc import Callable
+from typing import Any, TypeVar
 
 import structlog
 
 from case_record.cases import Cases
 from case_record.record import CaseRecord
-from room_config.load import ConfigError
+from room_config.load import Config, ConfigError
 from room_config.networks import address_of
 from room_config.openigtlink import OpenIgtLinkConfig
-from room_config.service import GuideConfig
 from service.room.control import STALE_S, ControlLoop
 from service.room.state import RoomState
-from service.slicer.messages import Message
-from service.slicer.scene import Images, Scene, scene_of, stale_scene
+from service.slicer.peer import Peer
+from service.slicer.pose import CURRENT_POSITION, Pose, pose_message, pose_of
+from service.slicer.scene import Images, Scene, scene_of, stale
 
+Found = TypeVar("Found")
 _LOOK_S = 0.05
 _STATUS_EVERY_S = 1.0
-_PATIENCE_S = 5.0
-_READ_BYTES = 65536
 
 log = structlog.get_logger("openigtlink")
 
@@ -55,26 +57,21 @@ class OpenIgtLinkServer:
     """`start` it in the server's event loop, `close` it at the end."""
 
     def __init__(
-        self,
-        config: OpenIgtLinkConfig,
-        cases: Cases,
-        loop: ControlLoop,
-        listening: socket.socket,
-        guide: GuideConfig | None = None,
+        self, config: Config, cases: Cases, loop: ControlLoop, listening: socket.socket
     ) -> None:
-        """guide: of a room with two fiducials."""
         self._listening = listening
         self._config = config
         self._cases = cases
         self._loop = loop
-        self._networks = [ipaddress.ip_network(text) for text in config.peer_networks]
-        self._guide = guide
+        self._own = config.openigtlink
+        self.inwards = self._own.inwards
+        self._networks = [ipaddress.ip_network(text) for text in self._own.peer_networks]
         self._images = Images()
-        self._scene: Scene = {}
-        self._changed = asyncio.Condition()
+        self._peers: set[Peer] = set()
+        self._passed_over: Counter[str] = Counter()
+        self.scene: Scene = {}
         self._server: asyncio.Server | None = None
         self._watching: asyncio.Task[None] | None = None
-        self.receivers = 0
 
     async def start(self) -> None:
         self._server = await asyncio.start_server(self._serve, sock=self._listening)
@@ -88,93 +85,95 @@ class OpenIgtLinkServer:
         with contextlib.suppress(asyncio.CancelledError):
             await self._watching
 
-    # What there is to send
+    @property
+    def receivers(self) -> int:
+        return len(self._peers)
+
+    @property
+    def passed_over(self) -> Counter[str]:
+        """Messages of all peers since the start that were not heeded, by reason."""
+        return sum((peer.passed_over for peer in self._peers), self._passed_over)
+
+    # The room, as peers see it
+
+    @property
+    def state(self) -> RoomState:
+        """Of now: what the room no longer says is not what it does."""
+        state = self._loop.state
+        return stale(state) if self._loop.state_age_s > STALE_S else state
+
+    def stop(self, by: str, *, emergency: bool) -> None:
+        self._loop.stop(by, emergency=emergency)
+
+    def call(self, name: str, arguments: dict[str, Any]) -> Any:
+        return self._loop.call(name, arguments)
+
+    def pose(self) -> Pose | None:
+        """Reads the record: not for the event loop's thread."""
+        return self._from_record(lambda state, record: pose_of(state, record, self._config), None)
 
     async def _watch(self) -> None:
         revision, told_s = -1, 0.0
         now_s = asyncio.get_running_loop().time
         while True:
             await asyncio.sleep(_LOOK_S)
-            state = self._loop.state
+            state = self.state
             due = now_s() - told_s >= _STATUS_EVERY_S  # that the room lives
-            if not self.receivers or not (due or state.revision != revision):
+            if not self._peers or not (due or state.revision != revision):
                 continue
             revision, told_s = state.revision, now_s()
-            # what the room no longer says is not sent as what it does now
-            is_stale = self._loop.state_age_s > STALE_S
-            scene = stale_scene(state) if is_stale else scene_of(state, self._guide)
-            try:
-                scene |= await asyncio.to_thread(self._images_of, state)
-            except Exception as error:
-                log.warning("scene without images", reason=str(error))
-            async with self._changed:
-                self._scene = scene
-                self._changed.notify_all()
+            scene = scene_of(state, self._config.service.guide)
+            more = await asyncio.to_thread(self._from_record, self._read, {})
+            self.scene = scene | more
+            for peer in list(self._peers):
+                peer.look(state.proposals)
 
-    def _images_of(self, state: RoomState) -> Scene:
-        if not state.case_uid:
-            return self._images.of(state, None)
-        with CaseRecord(self._cases.required()) as record:
-            return self._images.of(state, record)
+    def _read(self, state: RoomState, record: CaseRecord | None) -> Scene:
+        pose = pose_of(state, record, self._config)
+        return {
+            CURRENT_POSITION: pose_message(pose, state.at_s),
+            **self._images.of(state, record),
+        }
 
-    # One receiver
+    def _from_record(
+        self, look: Callable[[RoomState, CaseRecord | None], Found], otherwise: Found
+    ) -> Found:
+        state = self.state
+        try:
+            if not state.case_uid:
+                return look(state, None)
+            with CaseRecord(self._cases.required()) as record:
+                case = record.case()
+                is_same = case is not None and case.case_uid == state.case_uid
+                return look(state, record if is_same else None)
+        except Exception as error:
+            log.warning("scene without images and pose", reason=str(error))
+            return otherwise
+
+    # One peer
 
     async def _serve(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
-        peer = str(writer.get_extra_info("peername")[0])
-        reason = self._why_not(peer)
+        host, port = writer.get_extra_info("peername")[:2]
+        name = f"{host}:{port}"
+        reason = self._why_not(str(host))
         if reason:
-            log.warning("receiver refused", peer=peer, reason=reason)
+            log.warning("peer refused", peer=name, reason=reason)
             writer.close()
             return
-        self.receivers += 1
-        log.info("receiver connected", peer=peer)
-        sending = asyncio.create_task(self._send(writer))
-        gone = asyncio.create_task(_read_to_end(reader))
+        peer = Peer(name, self, reader, writer)
+        self._peers.add(peer)
+        log.info("peer connected", peer=name)
         try:
-            await asyncio.wait({sending, gone}, return_when=asyncio.FIRST_COMPLETED)
+            await peer.run()
         finally:
-            for task in (sending, gone):
-                task.cancel()
-            await asyncio.gather(sending, gone, return_exceptions=True)
-            self.receivers -= 1
-            log.info("receiver gone", peer=peer)
-            writer.transport.abort()
+            self._peers.discard(peer)
+            self._passed_over += peer.passed_over
+            log.info("peer gone", peer=name)
+            peer.hang_up()
 
-    def _why_not(self, peer: str) -> str:
-        if self._networks and not any(address_of(peer) in network for network in self._networks):
+    def _why_not(self, host: str) -> str:
+        if self._networks and not any(address_of(host) in network for network in self._networks):
             return "its address is not in openigtlink.peer_networks"
-        if self.receivers >= self._config.max_receivers:
+        if self.receivers >= self._own.max_receivers:
             return f"{self.receivers} are connected already"
         return ""
-
-    async def _send(self, writer: asyncio.StreamWriter) -> None:
-        sent: Scene = {}
-        while True:
-            async with self._changed:
-                await self._changed.wait()
-                scene = self._scene
-            for device, message in scene.items():
-                if _is_news(message, sent.get(device)):
-                    writer.write(message.encoded(_version_for(message)))
-                    await asyncio.wait_for(writer.drain(), _PATIENCE_S)
-            sent = scene
-
-
-def _is_news(message: Message, sent: Message | None) -> bool:
-    """Whether a receiver lacks it; that time went on is news for STATUS and images only."""
-    if message.kind in ("STATUS", "IMAGE"):
-        return message.kind == "STATUS" or message != sent
-    if sent is None:
-        return message.kind == "POINT" or not message.withdraws
-    return (message.content, message.meta) != (sent.content, sent.meta)
-
-
-def _version_for(message: Message) -> int:
-    """All read version 1; that something ended can be said in version 2 only."""
-    return 2 if message.withdraws else 1
-
-
-async def _read_to_end(reader: asyncio.StreamReader) -> None:
-    """Until the receiver hangs up; whatever it says is not heeded."""
-    while await reader.read(_READ_BYTES):
-        pass

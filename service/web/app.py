@@ -38,9 +38,11 @@ from service.web.routes.images import measurement_image_router, slice_image_rout
 from service.web.routes.live import live_router
 from service.web.routes.outputs import outbox_router, output_router
 from service.web.routes.procedure import procedure_router
+from service.web.routes.proposals import proposal_router
 from service.web.routes.record import event_router, measurement_router, slice_router
 from service.web.routes.record_edits import clerk_router
 from service.web.routes.robot import robot_router, stop_router
+from service.web.routes.settings import settings_router
 from service.web.routes.target import target_router
 from service.web.schemas import Health
 
@@ -120,6 +122,8 @@ def create_app(
         document_router(),
         robot_router(orders),
         target_router(orders),
+        settings_router(orders),
+        proposal_router(orders),
         procedure_router(orders),
         clerk_router(orders),
         access_router(access, cookie_path=urlsplit(service.public_url).path or "/"),

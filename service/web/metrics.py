@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Protocol
 
 from prometheus_client.core import GaugeMetricFamily
@@ -18,6 +18,9 @@ class Receivers(Protocol):
 
     @property
     def receivers(self) -> int: ...
+
+    @property
+    def passed_over(self) -> Mapping[str, int]: ...
 
 
 class RoomMetrics(Collector):
@@ -46,6 +49,16 @@ class RoomMetrics(Collector):
             "Connected receivers of the scene.",
             value=float(0 if self._receivers is None else self._receivers.receivers),
         )
+        passed_over = GaugeMetricFamily(
+            "autospine_openigtlink_passed_over",
+            "Messages of peers that were not heeded.",
+            labels=["reason"],
+        )
+        for reason, count in (
+            {} if self._receivers is None else self._receivers.passed_over
+        ).items():
+            passed_over.add_metric([reason], count)
+        yield passed_over
         parts = GaugeMetricFamily(
             "autospine_process_up", "1 while a process of the room works.", labels=["process"]
         )

@@ -51,6 +51,15 @@ class TargetBody(PointBody):
     )
 
 
+class TakeBody(Ask):
+    """Take a proposal over; what only the operator can say must be said."""
+
+    in_water: bool = Field(
+        description="True: the target is a place in tissue; false: where the fiducial is to be."
+    )
+    label: str = Field(default="", max_length=80)
+
+
 class AnswerBody(Ask):
     """The answer to the question that the state shows, named by its id."""
 
@@ -73,6 +82,12 @@ class StopBody(_Body):
     model_config = ConfigDict(extra="ignore")
     by: str = Field(default="operator", max_length=200)
     emergency: bool = Field(default=False, description="True: also park the drives.")
+
+
+class StopAnswer(BaseModel):
+    """What became of a STOP by the time of the answer."""
+
+    outcome: Literal["stopped", "on_its_way", "not_delivered"]
 
 
 class JogBody(Ask):

@@ -18,6 +18,7 @@ import typer
 from rich.console import Console
 
 from case_record.record import CaseRecord
+from room_config.exit_codes import BAD_INPUT, COULD_NOT, INTERRUPTED
 from service.cli.children import ChildError, quiet_environment
 from service.client import RoomClient
 from simulator.config import parse_virtual_room
@@ -27,7 +28,6 @@ from simulator.demo.screen import DemoScreen, final_table
 from simulator.truth_client import TruthAddress
 from simulator.unintended import ask_motions, unintended_motions
 
-BAD_INPUT, COULD_NOT, INTERRUPTED = 2, 3, 130
 app = typer.Typer(add_completion=False)
 
 

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from room_config.exit_codes import COULD_NOT
 from service.client import RefusedByServiceError, RoomClient, ServiceGoneError
 from simulator.config import VirtualRoom
 from simulator.scene import true_fiducial_mm, true_guide
@@ -36,7 +37,7 @@ _CLOCK_READING_S = 0.02
 class DemoFailedError(Exception):
     """The room could not do its job; the text says why."""
 
-    exit_code = 3
+    exit_code = COULD_NOT
 
 
 @dataclass(frozen=True)
@@ -120,6 +121,8 @@ class Operator:
             self._compare_clocks_if_slices_are_refused(state["acquisition_request"])
         elif state["ready"]:
             self._puncture(state)
+        elif robot["insertion_locked"]:
+            self._order(self._client.needle_out)  # READY was lost: nothing was inserted
         elif len(self.results) >= punctures:
             return False
         elif not state["calibrated"] or "calibrate again" in state["last_outcome"]:
@@ -156,8 +159,6 @@ class Operator:
 
     def _puncture(self, state: dict[str, Any]) -> None:
         arrival = state["arrival"]
-        if not state["robot"]["insertion_locked"]:
-            return  # READY is complete only when motion is locked
         if all(r.procedure_id != arrival["procedure_id"] for r in self.results):
             self._write_result(self._result(arrival, state["target_patient_mm"]))
             self._order(self._client.record_puncture)

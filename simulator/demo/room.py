@@ -14,6 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from room_config.exit_codes import BAD_INPUT
 from room_config.shell import autospine
 from service.cli.children import ChildError, Family
 from service.web.access import new_token, token_hash
@@ -48,7 +49,7 @@ class DemoOptions:
 class PortInUseError(Exception):
     """A port that the user asked for cannot be had."""
 
-    exit_code = 2
+    exit_code = BAD_INPUT
 
 
 class DemoRoom:

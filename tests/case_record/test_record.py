@@ -215,3 +215,18 @@ def test_where_the_commit_fails_nothing_stays_open(tmp_path):
         record.append_event("note", {}, source="test")
         with CaseRecord(tmp_path) as other:
             assert [event.kind for event in other.events()] == ["note"]
+
+
+def test_the_record_and_its_folder_are_for_their_owner_alone(tmp_path):
+    folder = tmp_path / "case"
+    with CaseRecord(folder, create=True) as record:
+        record.start_case("x", seed=0)
+        modes = {p.name: p.stat().st_mode & 0o777 for p in (folder, *folder.iterdir())}
+    assert modes.pop("case") == 0o700
+    assert FILE_NAME in modes
+    assert set(modes.values()) == {0o600}
+    folder.chmod(0o755)  # as an older program made it
+    (folder / FILE_NAME).chmod(0o644)
+    CaseRecord(folder, create=True).close()
+    assert folder.stat().st_mode & 0o777 == 0o700
+    assert (folder / FILE_NAME).stat().st_mode & 0o777 == 0o600

@@ -2,13 +2,23 @@
 
 from __future__ import annotations
 
+import asyncio
+import time
+
 from fastapi import APIRouter, Request, Response
+from fastapi.responses import HTMLResponse, JSONResponse
 
 from service.room.control import ControlLoop
 from service.web.orders import REFUSALS, Caller, Key, Orders, who
 from service.web.problems import responses
-from service.web.schemas import Ask, JogBody, Started, StopBody
+from service.web.schemas import Ask, JogBody, Started, StopAnswer, StopBody
 
+STOP_WORDS = {
+    "stopped": "Stopped.",
+    "on_its_way": "STOP is on its way: the robot does not stand yet.",
+    "not_delivered": "STOP was NOT DELIVERED – USE THE STOP SWITCH at the robot.",
+}
+_STOP_PATIENCE_S, _STOP_LOOK_S = 0.7, 0.01
 _STOP_EXAMPLE = {"by": "Olga", "emergency": False}
 
 
@@ -19,7 +29,7 @@ def stop_router(loop: ControlLoop) -> APIRouter:
     @router.post(
         "/api/v1/stop",
         status_code=202,
-        response_class=Response,
+        response_model=StopAnswer,
         responses=responses(401, 413),
         openapi_extra={
             "requestBody": {
@@ -31,12 +41,39 @@ def stop_router(loop: ControlLoop) -> APIRouter:
         },
     )
     async def stop(request: Request, caller: Caller) -> Response:
-        """Stop the robot at once; latched until re-armed. Viewers may do this too."""
+        """Stop the robot at once; latched until re-armed. Viewers may do this too.
+
+        The answer says what became of it, within a second: `stopped`, `on_its_way` (the bridge has
+        it, the robot does not stand yet) or `not_delivered`: use the stop switch at the robot. The
+        service goes on trying. Orders that were asked for before this answer are void.
+        """
         body = _stop_body(await request.body())
-        loop.stop(who(caller, body.by), emergency=body.emergency)
-        return Response(status_code=202)
+        number = loop.stop(who(caller, body.by), emergency=body.emergency)
+        try:
+            outcome = await _outcome_of_stop(loop)
+        finally:
+            loop.stop_answered(number)
+        if "text/html" in request.headers.get("accept", ""):
+            return HTMLResponse(_stop_page(outcome), status_code=202)
+        return JSONResponse({"outcome": outcome}, status_code=202)
 
     return router
+
+
+async def _outcome_of_stop(loop: ControlLoop) -> str:
+    """What became of a STOP that was just sent; waits a little for it to arrive."""
+    until_s = time.monotonic() + _STOP_PATIENCE_S
+    while (outcome := loop.stop_outcome()) != "stopped" and time.monotonic() < until_s:
+        await asyncio.sleep(_STOP_LOOK_S)
+    return outcome
+
+
+def _stop_page(outcome: str) -> str:
+    """For a browser in which the page's scripts do not run: its STOP button is a form."""
+    return (
+        '<!doctype html><html lang="en"><head><meta charset="utf-8"><title>STOP</title></head>'
+        f'<body><h1>{STOP_WORDS[outcome]}</h1><p><a href="/">Back to the page</a></p></body></html>'
+    )
 
 
 def _stop_body(text: bytes) -> StopBody:

@@ -9,31 +9,36 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
-from service.room.commands_procedure import ProcedureCommands
-from service.room.commands_record import RecordCommands
-from service.room.commands_robot import RobotCommands
-from service.room.commands_target import TargetCommands
+from service.room.commands.procedure import ProcedureCommands
+from service.room.commands.proposals import ProposalCommands
+from service.room.commands.record import RecordCommands
+from service.room.commands.robot import RobotCommands
+from service.room.commands.settings import SettingsCommands
+from service.room.commands.target import TargetCommands
 from service.room.context import Room
+from service.room.ready_keeper import keep_ready
 
 
 class Commands:
     """Everything that may be asked, by name."""
 
     def __init__(self, room: Room) -> None:
-        self._robot = RobotCommands(room)
-        self._by_name = {one.__name__: one for one in _all_of(room, self._robot)}
+        self._room = room
+        self._by_name = {one.__name__: one for one in _all_of(room)}
 
     def carry_out(self, name: str, arguments: Mapping[str, Any]) -> Any:
         """Carry out a command; raises ConflictError if it cannot be done now."""
         return self._by_name[name](**arguments)
 
-    def keep_lock(self) -> None:
-        """See RobotCommands.keep_lock: nobody asks for it, it is done all the time."""
-        self._robot.keep_lock()
+    def keep_ready(self) -> None:
+        """See `ready_keeper`: nobody asks for it, it is done all the time."""
+        keep_ready(self._room)
 
 
-def _all_of(room: Room, robot: RobotCommands) -> tuple[Callable[..., Any], ...]:
+def _all_of(room: Room) -> tuple[Callable[..., Any], ...]:
+    robot = RobotCommands(room)
     target, procedure, record = TargetCommands(room), ProcedureCommands(room), RecordCommands(room)
+    proposals = ProposalCommands(room, target)
     return (
         robot.reset,
         robot.note_stop,
@@ -56,4 +61,9 @@ def _all_of(room: Room, robot: RobotCommands) -> tuple[Callable[..., Any], ...]:
         record.describe_case,
         record.compare_clocks,
         record.forget_clock,
+        SettingsCommands(room).change_settings,
+        proposals.propose,
+        proposals.take_proposal,
+        proposals.refuse_proposal,
+        proposals.note_registration,
     )

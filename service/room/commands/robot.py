@@ -6,8 +6,9 @@ from robot_bridge.client.client import BridgeError
 from service.procedure.plan import PlanRefusedError, check_travel
 from service.procedure.registry import JOG
 from service.procedure.start_point import POSITION_DECLARED, positions_to_declare
-from service.room.context import SOURCE, Room
-from service.room.readiness import ConflictError, ready_arrival
+from service.room.context import Room
+from service.room.present import NEEDLE_OUT
+from service.room.readiness import ConflictError
 
 
 class RobotCommands:
@@ -19,6 +20,7 @@ class RobotCommands:
     def reset(self, by: str) -> None:
         """Clear a latched stop, take the positions as they stand or are recorded, and arm."""
         status = self._room.linked()
+        pressed = self._room.stops.pressed
         try:
             if not status.position_certain:
                 positions_um = positions_to_declare(self._room.record, status.positions_um)
@@ -32,6 +34,7 @@ class RobotCommands:
                 self._room.link.client.arm(by)
         except BridgeError as error:
             raise ConflictError("robot_refused", str(error)) from error
+        self._room.stops.release(pressed)
         self._room.note("armed", by, {})
 
     def note_stop(self, by: str, emergency: bool) -> None:
@@ -70,23 +73,10 @@ class RobotCommands:
     def needle_out(self, by: str) -> None:
         """The needle is out: unlock motion."""
         status = self._room.linked()
-        self._room.note("needle_out", by, {})
+        self._room.note(NEEDLE_OUT, by, {})
         if not status.insertion_locked:
             return
         try:
             self._room.link.client.set_insertion_lock(False, by)
         except BridgeError as error:
             raise ConflictError("robot_refused", str(error)) from error
-
-    def keep_lock(self) -> None:
-        """Hold the insertion lock from READY until the operator says that the needle is out."""
-        status = self._room.link.status
-        if status is None or status.insertion_locked or status.moving:
-            return
-        if ready_arrival(self._room.record) is None:
-            return
-        try:
-            self._room.link.client.set_insertion_lock(True, SOURCE)
-        except BridgeError:
-            return  # asked again at the next tick; until then `may_start` refuses every motion
-        self._room.note("insertion_locked", SOURCE, {})

@@ -20,9 +20,16 @@ from service.procedure.registry import (
     guide_calibration_arguments,
 )
 from service.procedure.steering import CONFIRM
-from service.procedure.targets import Target, TargetError, current_entry, current_target
+from service.procedure.targets import (
+    Target,
+    TargetError,
+    current_entry,
+    current_entry_number,
+    current_target,
+)
 from service.room.context import Room
-from service.room.readiness import ConflictError, ready_arrival
+from service.room.present import PUNCTURE, readiness
+from service.room.readiness import ConflictError
 
 
 class ProcedureCommands:
@@ -63,7 +70,7 @@ class ProcedureCommands:
         target = self._target()
         try:
             arguments = approach_of(
-                self._room.config,
+                self._room.settings(),
                 self._room.link.travel_um,
                 start,
                 target,
@@ -81,9 +88,10 @@ class ProcedureCommands:
         if entry_mm is None:
             raise ConflictError("no_entry", "Set an entry point first: the needle has a direction.")
         try:
+            settings = self._room.settings()
             arguments = guide_approach_of(
-                self._room.config,
-                guide,
+                settings,
+                settings.service.guide or guide,
                 self._room.travel(),
                 start,
                 entry_mm,
@@ -92,7 +100,9 @@ class ProcedureCommands:
             )
         except TargetError as error:
             raise _unusable(error) from error
+        entry = current_entry_number(self._room.record)
         body = {**guide_approach_arguments(arguments, start), "target": target.number}
+        body["entry"] = entry
         return self._room.begin(GUIDE_APPROACH, body, by)
 
     def _target(self) -> Target:
@@ -164,16 +174,21 @@ class ProcedureCommands:
 
     def puncture(self, by: str, insertion_depth_mm: float | None = None) -> None:
         """Record that the puncture was made. Motion stays locked until the needle is out."""
-        arrival = ready_arrival(self._room.record)
-        if arrival is None:
+        found = readiness(self._room.record, self._room.now())
+        if found is None:
             raise ConflictError("not_ready", "The needle guide is not at a target (not READY).")
+        if found.lost is not None:
+            text = f"READY was lost: {found.lost.text}. Measure again before the puncture."
+            raise ConflictError("not_ready", text)
+        if not found.ready:
+            raise ConflictError("not_ready", "Motion is not locked yet: wait for READY.")
         body = {
-            "procedure_id": arrival[0],
+            "procedure_id": found.procedure_id,
             "insertion_depth_mm": insertion_depth_mm,
-            "error_mm": arrival[1]["error_mm"],
-            "sigma_mm": arrival[1]["sigma_mm"],
+            "error_mm": found.arrival["error_mm"],
+            "sigma_mm": found.arrival["sigma_mm"],
         }
-        self._room.note("puncture", by, body)
+        self._room.note(PUNCTURE, by, body)
 
 
 def _unusable(error: TargetError) -> ConflictError:

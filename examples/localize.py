@@ -1,0 +1,33 @@
+"""The round objects in DICOM files: centre ± σ in pixels, and where that is in the patient.
+
+python examples/localize.py PATH…  [--radius-mm 3,12]
+"""
+
+import argparse
+from pathlib import Path
+
+from dicom_slice.read import dicom_files, read_frames
+from sr_engine.errors import EngineError
+from sr_engine.locate import locate_all
+
+parser = argparse.ArgumentParser(description=__doc__)
+parser.add_argument("path", type=Path, nargs="+")
+parser.add_argument("--radius-mm", default="3,12")
+arguments = parser.parse_args()
+smallest_mm, largest_mm = map(float, arguments.radius_mm.split(","))
+
+for file in dicom_files(arguments.path):
+    for header, pixels in read_frames(file):
+        pixel_mm = header.geometry.spacing_mm[0]
+        try:
+            found = locate_all(pixels, (smallest_mm / pixel_mm, largest_mm / pixel_mm))
+        except EngineError as error:
+            print(f"{file.name}: {error}")
+            continue
+        for one in found:
+            row, col = one.centre_px
+            x, y, z = header.geometry.patient_from_pixel(one.centre_px)
+            print(
+                f"{file.name}: row {row:.3f} ± {one.sigma_px[0]:.3f} px, "
+                f"col {col:.3f} ± {one.sigma_px[1]:.3f} px, at ({x:.2f}, {y:.2f}, {z:.2f}) mm"
+            )

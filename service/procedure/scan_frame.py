@@ -1,0 +1,70 @@
+"""What a position in a slice is relative to, and by which protocol it appears where it does.
+
+A study or a frame of reference that begins anew may mean a table that has moved: nothing that was
+seen before is where it was. A protocol with another bandwidth, imaging frequency or encoding
+direction shows the fiducial's oil elsewhere beside the anatomy's water.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any
+
+_SAME_SHARE = 1e-3
+
+
+@dataclass(frozen=True)
+class ScanFrame:
+    """Of a slice, as its header says it; empty or None: the header does not say."""
+
+    study: str = ""
+    frame_of_reference: str = ""
+    imaging_frequency_mhz: float | None = None
+    pixel_bandwidth_hz: float | None = None
+    phase_encoding_direction: str = ""
+
+    @classmethod
+    def of_header(cls, header: Mapping[str, Any]) -> ScanFrame:
+        """From a slice's header as the case record keeps it."""
+        return cls(
+            str(header.get("study_instance_uid") or ""),
+            str(header.get("frame_of_reference_uid") or ""),
+            header.get("imaging_frequency_mhz"),
+            header.get("pixel_bandwidth_hz"),
+            str(header.get("phase_encoding_direction") or ""),
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        return asdict(self)
+
+    def other_place(self, other: ScanFrame) -> str:
+        """What says that positions of the two need not be comparable; empty if nothing does."""
+        if _differ(self.frame_of_reference, other.frame_of_reference):
+            return "another frame of reference"
+        if _differ(self.study, other.study):
+            return "another study"
+        return ""
+
+    def other_protocol(self, other: ScanFrame) -> str:
+        """What shows oil elsewhere beside water in the other's slices; empty if nothing does."""
+        for name, mine, others in (
+            ("pixel bandwidth", self.pixel_bandwidth_hz, other.pixel_bandwidth_hz),
+            ("imaging frequency", self.imaging_frequency_mhz, other.imaging_frequency_mhz),
+        ):
+            if mine is None or others is None:
+                if mine is not others:
+                    return f"a {name} where the other says none"
+            elif not abs(mine - others) <= _SAME_SHARE * abs(mine):
+                return f"another {name} ({others:g} instead of {mine:g})"
+        if self.phase_encoding_direction != other.phase_encoding_direction:
+            return (
+                f"another phase encoding direction ({other.phase_encoding_direction or 'unknown'} "
+                f"instead of {self.phase_encoding_direction or 'unknown'})"
+            )
+        return ""
+
+
+def _differ(mine: str, others: str) -> bool:
+    """Two that are both known and not the same."""
+    return bool(mine) and bool(others) and mine != others

@@ -1,0 +1,1 @@
+"""What may be asked of the control loop, a module a subject."""

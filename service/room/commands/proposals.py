@@ -1,0 +1,141 @@
+"""Commands about what planning stations propose: record it, take it over, refuse it.
+
+Whoever is on the network may propose; only the operator takes over.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+from service.procedure.registry import latest_calibration
+from service.room.commands.target import TargetCommands
+from service.room.context import Room
+from service.room.proposals import (
+    MOST_OPEN,
+    PROPOSED,
+    REFUSED,
+    TAKEN,
+    Plan,
+    ProposalBook,
+    ProposalState,
+    Verdict,
+    frame_of_reference,
+    why_not_in_bore,
+    why_other_frame,
+    why_senseless,
+)
+from service.room.reach import OutOfReachError, ReachUnknownError, check_reach, entry_of
+from service.room.readiness import ConflictError
+
+TURNED_AWAY = "proposal_turned_away"
+REGISTRATION = "registration_received"
+
+
+class ProposalCommands:
+    """Proposals never change a plan by themselves."""
+
+    def __init__(self, room: Room, target: TargetCommands) -> None:
+        self._room = room
+        self._target = target
+        self._book = ProposalBook()
+
+    def propose(self, plan: Plan, by: str) -> Verdict:
+        """Record a plan for the operator to see, unless it cannot be one."""
+        known = self._book.update(self._room.record)
+        mine = [one for one in known if one.state == "open" and _same(one, plan)]
+        if mine:
+            return Verdict("proposed", _waits(mine[0]), mine[0].number, not mine[0].note)
+        verdict = self._judge(plan, known)
+        if verdict.code != "proposed":
+            body = {"sender": plan.sender, "name": plan.name, "via": plan.via, "why": verdict.text}
+            self._room.note(TURNED_AWAY, by, body)
+            return verdict
+        body = {**_as_json(plan), "note": "" if verdict.reach_known else verdict.text}
+        self._room.note(PROPOSED, by, body)
+        new = self._book.update(self._room.record)[-1]
+        return Verdict("proposed", _waits(new), new.number, verdict.reach_known)
+
+    def _judge(self, plan: Plan, known: list[ProposalState]) -> Verdict:
+        why = why_senseless(plan) or why_other_frame(
+            plan.frame_of_reference_uid, frame_of_reference(self._room.record)
+        )
+        if why:
+            return Verdict("invalid", why)
+        others = [one for one in known if one.state == "open" and one.sender != plan.sender]
+        if len(others) >= MOST_OPEN:
+            return Verdict("too_many", f"{len(others)} proposals wait for the operator already")
+        if why := why_not_in_bore(plan):
+            return Verdict("out_of_reach", why)
+        try:
+            check_reach(self._room, plan)
+        except OutOfReachError as error:
+            return Verdict("out_of_reach", str(error))
+        except ReachUnknownError as error:
+            return Verdict("proposed", str(error))
+        return Verdict("proposed", "", reach_known=True)
+
+    def take_proposal(self, number: int, by: str, in_water: bool, label: str = "") -> None:
+        """Make a proposal the target (and entry). in_water: a place in tissue; nobody but the
+        operator can say that.
+        """
+        one = self._open(number)
+        room = self._room
+        plan = Plan(one.sender, one.name, one.via, one.target_mm, one.entry_mm, one.direction)
+        why = why_other_frame(one.frame_of_reference_uid, frame_of_reference(room.record))
+        if why:
+            raise ConflictError("other_frame", f"Not taken over: {why}.")
+        entry_mm = one.entry_mm
+        try:
+            if plan.target_mm is not None:
+                check_reach(room, plan, in_water=in_water)
+        except OutOfReachError as error:
+            raise ConflictError("out_of_reach", f"Not taken over: {error}.") from error
+        except ReachUnknownError:
+            pass  # an approach asks again before anything moves
+        guide = room.config.service.guide
+        calibration = latest_calibration(room.record, guide=guide is not None)
+        if entry_mm is None and one.direction is not None and guide and calibration:
+            entry_mm = entry_of(room, plan, calibration)
+        with room.record.transaction():
+            if entry_mm is not None:
+                self._target.set_entry(entry_mm, by)
+            if one.target_mm is not None:
+                self._target.set_target(one.target_mm, by, label or one.name, in_water)
+            room.note(TAKEN, by, {"proposal": number, "sender": one.sender, "in_water": in_water})
+
+    def refuse_proposal(self, number: int, by: str, why: str = "") -> None:
+        """Say no; the sender is told why."""
+        one = self._open(number)
+        self._room.note(REFUSED, by, {"proposal": number, "sender": one.sender, "why": why})
+
+    def note_registration(self, by: str, name: str, matrix: list[list[float]]) -> None:
+        """Somebody's transform from a fixture to the scanner: kept and shown, nothing else."""
+        body = {"sender": by, "name": name, "matrix_lps": matrix}
+        last = self._room.record.last_event(REGISTRATION)
+        if last is None or dict(last.body) != body:
+            self._room.note(REGISTRATION, by, body)
+
+    def _open(self, number: int) -> ProposalState:
+        known = {one.number: one for one in self._book.update(self._room.record)}
+        one = known.get(number)
+        if one is None:
+            raise ConflictError("no_proposal", f"There is no proposal {number} in this case.")
+        if one.state != "open":
+            done = f"{one.state} by {one.by}" if one.by else one.reason
+            raise ConflictError("no_proposal", f"Proposal {number} is not open: {done}.")
+        return one
+
+
+def _as_json(plan: Plan) -> dict[str, Any]:
+    return {name: list(v) if isinstance(v, tuple) else v for name, v in asdict(plan).items()}
+
+
+def _same(one: ProposalState, plan: Plan) -> bool:
+    names = ("sender", "name", "target_mm", "entry_mm", "direction", "frame_of_reference_uid")
+    return all(getattr(one, name) == getattr(plan, name) for name in names)
+
+
+def _waits(one: ProposalState) -> str:
+    note = f"; {one.note}" if one.note else ""
+    return f"proposal {one.number} waits for the operator{note}"

@@ -1,0 +1,154 @@
+"""What planning stations propose: targets and entry points that nobody has taken over yet.
+
+A proposal is an event; that it was taken over or refused is another. Nothing in it changes the
+target before the operator says so, and of one sender only the newest is open.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+from case_record.record import CaseRecord
+from case_record.rows import Event
+
+PROPOSED, TAKEN, REFUSED = "plan_proposed", "proposal_taken", "proposal_refused"
+MOST_OPEN = 8
+_MOST_SHOWN = 24
+_BORE_MM = 500.0
+
+Point3 = tuple[float, float, float]
+
+
+class ProposalState(BaseModel):
+    """Patient LPS mm. state: open, taken, refused (with the reason), or replaced by a newer one."""
+
+    model_config = ConfigDict(frozen=True)
+
+    number: int
+    at_s: float
+    sender: str
+    name: str
+    via: str
+    target_mm: Point3 | None = None
+    entry_mm: Point3 | None = None
+    direction: Point3 | None = None
+    frame_of_reference_uid: str = ""
+    note: str = ""
+    state: str = "open"
+    by: str = ""
+    reason: str = ""
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What somebody proposes, patient LPS mm.
+
+    sender: where it came from; name: what the sender calls it. direction: unit vector of the
+    needle, where the plan has one. frame_of_reference_uid: empty where the way it came cannot tell.
+    """
+
+    sender: str
+    name: str
+    via: str
+    target_mm: Point3 | None
+    entry_mm: Point3 | None = None
+    direction: Point3 | None = None
+    frame_of_reference_uid: str = ""
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """code: `proposed` (its number is given), `invalid`, `out_of_reach` or `too_many`."""
+
+    code: str
+    text: str
+    number: int | None = None
+    reach_known: bool = False
+
+
+def why_senseless(plan: Plan) -> str:
+    """Why the numbers make no plan, whatever the room; empty where they do."""
+    if plan.target_mm is None and plan.entry_mm is None:
+        return "it has neither a target nor an entry point"
+    for name, place in (("target", plan.target_mm), ("entry", plan.entry_mm)):
+        if place is not None and not all(math.isfinite(value) for value in place):
+            return f"its {name} is not three finite numbers"
+    if plan.target_mm is not None and plan.target_mm == plan.entry_mm:
+        return "its entry point is its target: that is no direction"
+    return ""
+
+
+def why_not_in_bore(plan: Plan) -> str:
+    """Why no scanner could reach it; empty where one could."""
+    for name, place in (("target", plan.target_mm), ("entry", plan.entry_mm)):
+        if place is not None and not math.hypot(*place) <= _BORE_MM:
+            return f"its {name} is {math.hypot(*place):.0f} mm from the isocentre"
+    return ""
+
+
+def why_other_frame(plan_frame: str, room_frame: str) -> str:
+    """Why a plan is of another frame of reference; empty where it is not, or nobody can tell."""
+    if not plan_frame or not room_frame or plan_frame == room_frame:
+        return ""
+    return "it is given in another frame of reference than the slices have"
+
+
+def frame_of_reference(record: CaseRecord) -> str:
+    """Of the newest slice that was used; empty where there is none yet."""
+    row = record.last_slice("assigned") or record.last_slice()
+    return "" if row is None else str(row.header.get("frame_of_reference_uid") or "")
+
+
+class ProposalBook:
+    """The proposals of a case, from its events; each event is read once."""
+
+    def __init__(self) -> None:
+        self._case_uid = ""
+        self._seen_event_id = 0
+        self._known: dict[int, ProposalState] = {}
+
+    def update(self, record: CaseRecord) -> list[ProposalState]:
+        """Every open proposal and the newest others, in the order in which they came."""
+        case = record.case()
+        if case is None or case.case_uid != self._case_uid:
+            self._case_uid = "" if case is None else case.case_uid
+            self._seen_event_id, self._known = 0, {}
+        newest = record.last_event_id()
+        if newest != self._seen_event_id:
+            for event in _events(record, self._seen_event_id):
+                self._heed(event)
+            self._seen_event_id = newest
+        closed = [number for number, one in self._known.items() if one.state != "open"]
+        for number in closed[: max(0, len(self._known) - _MOST_SHOWN)]:
+            del self._known[number]
+        return list(self._known.values())
+
+    def _heed(self, event: Event) -> None:
+        body = event.body
+        if event.kind == PROPOSED:
+            for number, one in self._known.items():
+                if (one.sender, one.state) == (body["sender"], "open"):
+                    reason = f"proposal {event.event_id} came instead"
+                    self._close(number, {"state": "replaced", "reason": reason})
+            self._known[event.event_id] = ProposalState(
+                number=event.event_id, at_s=event.wall_s, **body
+            )
+        elif body.get("proposal") in self._known:
+            state = "taken" if event.kind == TAKEN else "refused"
+            change = {"state": state, "by": event.who, "reason": body.get("why", "")}
+            self._close(int(body["proposal"]), change)
+
+    def _close(self, number: int, change: Mapping[str, Any]) -> None:
+        self._known[number] = self._known[number].model_copy(update=dict(change))
+
+
+def _events(record: CaseRecord, after_id: int) -> list[Event]:
+    found = [
+        e for kind in (PROPOSED, TAKEN, REFUSED) for e in record.events_of_kind(kind, after_id)
+    ]
+    return sorted(found, key=lambda event: event.event_id)

@@ -1,0 +1,24 @@
+"""Each example does what its first lines say."""
+
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+from real_slices import SMALL_SET
+
+EXAMPLES = Path(__file__).parents[2] / "examples"
+
+
+def run(name: str, *words: object) -> str:
+    command = [sys.executable, EXAMPLES / name, *map(str, words)]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
+def test_localize_prints_centre_and_sigma_of_the_vials_of_a_real_slice():
+    said = run("localize.py", SMALL_SET / "hazen" / "nist_T2_site3_ge_plate4" / "Z815")
+    rows = re.findall(r"row ([\d.]+) ± ([\d.]+) px, col ([\d.]+) ± ([\d.]+) px", said)
+    assert len(rows) >= 14
+    assert all(float(sigma) < 0.2 for row in rows for sigma in row[1::2])

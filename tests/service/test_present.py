@@ -1,0 +1,334 @@
+"""What is shown is true now: what changes after a measurement, and where that is shown or used."""
+
+import time
+
+import pytest
+from line_room import patient_mm, running_line_room
+
+from case_record.record import CaseRecord
+from service.room.context import now_of
+from service.room.present import Now, lost_since_ready, readiness, why_not_now
+from service.room.readiness import ConflictError
+
+
+@pytest.fixture
+def room(tmp_path):
+    with running_line_room(tmp_path) as running:
+        yield running
+
+
+def lose_link(room):
+    room.do(room.line.unplug)
+    room.until(lambda s: not s.robot.linked)
+
+
+def lose_link_for_a_while(room):
+    lose_link(room)
+    room.do(lambda: room.line.run(2.0))
+    room.do(room.line.plug_in)
+    room.until(lambda s: s.robot.linked)
+
+
+def restart_bridge(room):
+    boot_id = room.state.robot.boot_id
+    room.do(room.line.crash_bridge)
+    room.until(lambda s: s.robot.linked and s.robot.boot_id != boot_id)
+
+
+def power_cycle(room):
+    room.do(lambda: setattr(room.line.motors, "_certain", False))
+    room.until(lambda s: not s.robot.position_certain)
+
+
+def fault(room):
+    room.do(lambda: setattr(room.line.motors, "fault", "moved_by_itself"))
+    room.until(lambda s: s.robot.stopped)
+
+
+def push(room):
+    def pushed():
+        for places in (room.line.stage.from_um, room.line.stage.to_um):
+            places["xt"] += 300
+
+    before = room.state.robot.positions_um
+    room.do(pushed)
+    room.until(lambda s: s.robot.positions_um != before)
+
+
+def declare(room):
+    positions_um = dict(room.state.robot.positions_um)
+    room.do(lambda: room.link.client.declare_position(positions_um, "somebody"))
+
+
+def unlock(room):
+    room.do(lambda: room.link.client.set_insertion_lock(False, "somebody"))
+
+
+def park(room):
+    room.do(lambda: setattr(room.line.stage, "parked", True))
+
+
+def jog(room):
+    """By somebody else at the bridge, past the lock: nothing of it goes through the service."""
+
+    def move():
+        room.link.client.set_insertion_lock(False, "somebody")
+        room.link.client.move("elsewhere/1", {**room.link.status.positions_um, "xt": 0}, None)
+
+    room.do(move)
+
+
+def set_other_target(room):
+    room.call("set_target", patient_mm=patient_mm(45.0, 61.0))
+
+
+# what happens after the measurement: what is done, and the code of why READY and error are gone
+CHANGES = {
+    "move": (jog, "moved"),
+    "stop": (lambda room: room.stop(), "stopped"),
+    "emergency": (lambda room: room.stop(emergency=True), "stopped"),
+    "stop and re-arm": (lambda room: (room.stop(), room.arm()), "stopped"),
+    "park": (park, "parked"),
+    "declare": (declare, "declared"),
+    "bridge restart": (restart_bridge, "bridge_restarted"),
+    "bridge restart and re-arm": (
+        lambda room: (restart_bridge(room), room.arm()),
+        "bridge_restarted",
+    ),
+    "controller power-cycle": (power_cycle, "position"),
+    "fault": (fault, "stopped"),
+    "pushed axis": (push, "elsewhere"),
+    "link loss": (lose_link, "no_link"),
+    "link loss for a while": (lose_link_for_a_while, "stopped"),
+    "lock missing": (unlock, "lock_missing"),
+    "other study": (lambda room: room.receive(study_instance_uid="1.2.2"), "other_place"),
+    "other frame of reference": (
+        lambda room: room.receive(frame_of_reference_uid="1.2.8"),
+        "other_place",
+    ),
+    "other bandwidth": (
+        lambda room: room.receive(room.state.hold.hold_id, pixel_bandwidth_hz=250.0),
+        "other_protocol",
+    ),
+    "other encoding direction": (
+        lambda room: room.receive(room.state.hold.hold_id, phase_encoding_direction="COL"),
+        "other_protocol",
+    ),
+    "target changed": (set_other_target, "target_changed"),
+    "target withdrawn": (lambda room: room.call("withdraw_target"), "target_withdrawn"),
+}
+# these take away READY, but not what the measurement says
+_ONLY_READY = {"lock missing", "target changed", "target withdrawn"}
+
+
+@pytest.mark.parametrize("change", CHANGES)
+def test_what_changes_after_a_measurement_takes_it_back_wherever_it_is_shown(room, change):
+    happens, code = CHANGES[change]
+    measured = room.ready().measurement
+    happens(room)
+    state = room.until(lambda s: s.ready_lost is not None)
+    # the page and the API
+    assert not state.ready
+    assert state.arrival is None
+    # what follows from the change (the deadman's stop after a lost link) may be seen first
+    assert state.ready_lost.code in {code, "stopped", "no_link"}
+    assert "READY:" not in state.prompt
+    assert measured.lost is None
+    if change in _ONLY_READY:
+        assert state.measurement.lost is None
+    else:
+        assert state.measurement.lost.code in {code, "stopped", "no_link"}
+        assert state.error is None
+        assert state.error_reason == state.measurement.lost.text
+    # the alarms
+    assert "ready_lost" in {alarm.code for alarm in state.alarms}
+    # the puncture
+    with pytest.raises(ConflictError) as refused:
+        room.call("puncture")
+    assert refused.value.code == "not_ready"
+    # the record, which is what DICOM outputs and reports know
+    with room.record() as record:
+        assert lost_since_ready(record, 2) is not None
+        assert not record.events_of_kind("puncture")
+
+
+@pytest.mark.parametrize("change", ["stop", "target changed", "other study", "park"])
+def test_a_ready_that_was_lost_does_not_come_back_by_itself(room, change):
+    target = room.ready().target_patient_mm
+    CHANGES[change][0](room)
+    room.until(lambda s: s.ready_lost is not None)
+    room.call("set_target", patient_mm=target)
+    if not change.startswith("other"):
+        room.arm()
+    assert not room.later().ready
+    room.call("needle_out")
+    assert room.later().ready_lost is None
+
+
+@pytest.mark.parametrize("step_s", [600, -600, 3600, -3600])
+@pytest.mark.parametrize("when", ["ready", "before"])
+def test_a_clock_that_is_set_changes_nothing_of_what_came_first(room, monkeypatch, step_s, when):
+    real = time.time
+    room.calibrate()
+    if when == "ready":
+        room.ready()
+    monkeypatch.setattr(time, "time", lambda: real() + step_s)
+    if when == "before":
+        room.ready()
+    state = room.later() if step_s > 0 else room.until(lambda s: s.at_s < real() + step_s / 2)
+    assert state.ready
+    assert state.robot.insertion_locked
+    room.call("puncture")
+    room.call("needle_out")
+    state = room.until(lambda s: not s.robot.insertion_locked)
+    assert not state.ready
+    room.call("jog", axis="xt", distance_um=500)
+    state = room.until(lambda s: s.procedure is None and not s.robot.moving)
+    assert state.error is None
+    assert state.error_reason == "measured before the last move"
+
+
+@pytest.mark.parametrize("step_s", [600, -600, 3600, -3600])
+def test_the_clock_is_set_and_the_next_arrival_locks_all_the_same(room, monkeypatch, step_s):
+    real = time.time
+    room.ready()
+    room.call("needle_out")
+    monkeypatch.setattr(time, "time", lambda: real() + step_s)
+    room.ready(-1.0, 0.5)
+    with pytest.raises(ConflictError) as refused:
+        room.call("jog", axis="xt", distance_um=1000)
+    assert refused.value.code == "insertion_locked"
+
+
+def test_between_a_move_and_the_next_measurement_there_is_no_error(room):
+    room.calibrate()
+    room.call("set_target", patient_mm=patient_mm(41.0, 58.0))
+    assert room.until(lambda s: s.target_patient_mm).error is not None
+    room.call("jog", axis="xt", distance_um=-2000)
+    state = room.until(lambda s: s.procedure is None and s.robot.positions_um["xt"] == -2000)
+    assert (state.error, state.error_reason) == (None, "measured before the last move")
+    assert state.measurement.patient_mm is not None  # drawn dashed: where it was
+
+
+def of_the_last(room, **changes):
+    """Why the last measurement does not hold, as things are in the room but for some changes."""
+
+    def ask():
+        now = now_of(room.config, room.link)
+        record = room.loop._record
+        last = record.last_measurement("done")
+        later = Now(**{**vars(now), **changes})
+        return why_not_now(record, last, later), readiness(record, later)
+
+    return room.do(ask)
+
+
+def test_ready_and_measurement_have_an_age_and_expire(room):
+    age_s = room.ready().measurement.age_s
+    assert 0 <= age_s < 60
+    assert room.state.arrival.age_s >= 0
+    valid_s = room.config.service.ready_valid_s
+    assert room.later().ready_valid_s == valid_s
+    now_s = time.monotonic()
+    lost, found = of_the_last(room, monotonic_s=now_s + valid_s - 60)
+    assert lost is None
+    assert found.ready
+    lost, found = of_the_last(room, monotonic_s=now_s + valid_s)
+    assert lost.code == found.lost.code == "expired"
+    assert not found.ready
+    # a computer that was started again counts from zero: no clock says how old it is
+    assert of_the_last(room, monotonic_s=now_s - 1e6)[0].code == "computer_restarted"
+    assert of_the_last(room, computer="another start")[0].code == "computer_restarted"
+
+
+def test_a_measurement_that_does_not_say_what_it_rests_on_does_not_hold(tmp_path):
+    with CaseRecord(tmp_path, create=True) as record:
+        record.start_case("older", 0)
+        number = record.request_measurement("ml", [], {})
+        record.finish_measurement(number, {})
+        now = Now(None, 300.0)
+        assert why_not_now(record, record.measurement(number), now).code == "unknown"
+
+
+def test_an_old_record_is_ordered_as_its_clock_had_it(tmp_path):
+    """A record of the program before, made by the migrations that it knew."""
+    import sqlite3
+
+    from case_record.sql import MIGRATIONS
+
+    db = sqlite3.connect(tmp_path / "case.sqlite")
+    db.executescript(MIGRATIONS[0])
+    db.execute("PRAGMA user_version = 1")
+    db.execute("INSERT INTO event VALUES (1, 10.0, 1.0, 's', '-', 'needle_out', '{}', '0', 'a')")
+    db.execute("INSERT INTO procedure VALUES (1, 'approach', '{}', 'done', '{}', 5.0, 11.0)")
+    db.execute("INSERT INTO event VALUES (2, 12.0, 2.0, 's', '-', 'needle_out', '{}', 'a', 'b')")
+    db.commit()
+    db.close()
+    with CaseRecord(tmp_path) as record:
+        out = record.events_of_kind("needle_out")
+        arrival = record.last_procedure("approach", "done")
+        assert out[0].seq < arrival.ended_seq < out[1].seq
+        number = record.append_event("later", {}, source="test")
+        assert record.events(number - 1)[0].seq > out[1].seq
+
+
+def test_after_a_stop_nothing_that_was_asked_before_moves_anything(room):
+    room.calibrate()
+    asked_s = time.monotonic()
+    room.stop()
+    for name, arguments in (
+        ("jog", {"axis": "xt", "distance_um": 3000}),
+        ("start_calibration", {}),
+        ("reset", {}),
+        ("needle_out", {}),
+    ):
+        with pytest.raises(ConflictError) as refused:
+            room.loop.call(name, {"by": "tester", **arguments}, asked_s)
+        assert refused.value.code == "void_after_stop"
+    begun = len(room.line.stage.begun)
+    room.arm()
+    room.later()
+    assert len(room.line.stage.begun) == begun
+
+
+def test_an_order_that_has_waited_is_not_carried_out_late(room):
+    room.arm()
+    with pytest.raises(ConflictError) as refused:
+        room.loop.call("jog", {"by": "t", "axis": "xt", "distance_um": 1000}, time.monotonic() - 10)
+    assert refused.value.code == "stale_order"
+    assert not room.line.stage.begun
+
+
+def test_a_stop_that_waits_for_its_answer_voids_what_comes_meanwhile(room):
+    room.arm()
+    number = room.do(lambda: room.loop.stop("tester"))
+    with pytest.raises(ConflictError) as refused:
+        room.call("jog", axis="xt", distance_um=1000)
+    assert refused.value.code == "void_after_stop"
+    room.loop.stop_answered(number)
+    room.until(lambda s: s.robot.stopped)
+    with pytest.raises(ConflictError) as refused:
+        room.call("jog", axis="xt", distance_um=1000)
+    assert refused.value.code == "not_armed"
+    assert room.arm().robot.armed
+
+
+@pytest.mark.parametrize("answer", ["go_on", "abort"])
+def test_after_an_interruption_only_a_new_order_moves_the_robot(room, answer):
+    room.arm()
+    room.do(lambda: setattr(room.line.stage, "speed_um_s", 500.0))
+    room.call("jog", axis="xt", distance_um=3000)
+    room.until(lambda s: s.robot.moving)
+    lose_link_for_a_while(room)
+    room.arm()
+    state = room.until(lambda s: s.question is not None)
+    begun = len(room.line.stage.begun)
+    assert state.question.choices == ["go_on", "abort"]
+    assert "xt" in state.question.question
+    room.later()
+    assert len(room.line.stage.begun) == begun
+    room.call("answer", question_id=state.question.question_id, choice=answer)
+    state = room.run_to_end()
+    there = state.robot.positions_um["xt"] == 3000
+    assert there == (answer == "go_on")
+    assert (len(room.line.stage.begun) > begun) == (answer == "go_on")
