@@ -12,7 +12,7 @@ function fill(element, attributes, children) {
     else if (name in element && !(element instanceof SVGElement)) element[name] = value;
     else element.setAttribute(name, value === true ? "" : value);
   }
-  element.append(...children.flat().filter((child) => child !== null && child !== undefined));
+  element.append(...children.flat(Infinity).filter((child) => child !== null && child !== undefined));
   return element;
 }
 
@@ -44,7 +44,7 @@ function signature(element) {
 export function replace(element, ...children) {
   const focused = document.activeElement;
   const same = element.contains(focused) && focused !== element ? signature(focused) : null;
-  element.replaceChildren(...children.flat().filter((child) => child !== null && child !== undefined));
+  element.replaceChildren(...children.flat(Infinity).filter((child) => child !== null && child !== undefined));
   if (!same || element.contains(document.activeElement)) return;
   const again = [...element.querySelectorAll(focused.tagName)].find(same) ?? element.closest("[tabindex='-1']");
   again?.focus({ preventScroll: true });

@@ -80,10 +80,11 @@ export function startHeader() {
   const top = byId("top");
   const act = byId("act");
   const measure = () => {
+    const foot = byId("foot").offsetHeight;
     document.documentElement.style.setProperty("--above", `${top.offsetHeight}px`);
+    document.documentElement.style.setProperty("--foot", `${foot}px`);
     // what is taller than the screen goes with the page; STOP stays at its bottom edge
-    const wanted = byId("act-scroll").scrollHeight + byId("foot").offsetHeight;
-    act.classList.toggle("tall", wanted > innerHeight - top.offsetHeight + 1);
+    act.classList.toggle("tall", byId("act-scroll").offsetHeight + foot > innerHeight - top.offsetHeight + 1);
   };
   const watch = new ResizeObserver(measure);
   [top, byId("next"), byId("numbers"), byId("pick-panel"), byId("needle"), byId("jog"), document.documentElement].forEach((one) => watch.observe(one));

@@ -69,15 +69,15 @@ export class Picking {
       type: "button", onclick: async () => { if (await act(() => order("POST", "api/v1/target/withdraw"))) this.end(); },
     }, words.withdraw) : null;
     replace(this.panel, h("h2", { id: "h-pick" }, words.heading), h("p", { class: "quiet" }, words.how),
-      h("div", { class: "fields more" }, this.inputs.map((input, k) => [h("label", { htmlFor: input.id }, words.axes[k]), input, h("span", { class: "quiet" }, words.unit)]).flat(),
-        h("label", { htmlFor: "pick-label" }, words.label), this.label),
+      h("div", { class: "point" }, this.inputs.map((input, k) => h("label", {}, `${words.axes[k]}, ${words.unit}`, input))),
+      h("div", { class: "fields more" }, h("label", { htmlFor: "pick-label" }, words.label), this.label),
       this.facts,
-      h("p", { class: "row" }, this.inTissue, h("label", { htmlFor: "in-tissue" }, words.inTissue)),
-      h("p", { class: "quiet" }, words.inTissueWhy),
-      h("p", { class: "row more" },
+      h("p", { class: "row" },
         h("button", { type: "button", id: "set-target", class: "main", onclick: () => this.set("target") }, words.setTarget),
         h("button", { type: "button", id: "set-entry", onclick: () => this.set("entry") }, words.setEntry), withdraw,
-        h("button", { type: "button", onclick: () => this.end() }, words.cancel)));
+        h("button", { type: "button", onclick: () => this.end() }, words.cancel)),
+      h("p", { class: "row more" }, this.inTissue, h("label", { htmlFor: "in-tissue" }, words.inTissue)),
+      h("p", { class: "quiet" }, words.inTissueWhy));
   }
 
   moveTo(pointMm) {
