@@ -28,7 +28,7 @@ from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
 from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
-from service.room.prompt import is_calibrated, outcome_text, prompt
+from service.room.prompt import is_calibrated, is_punctured, outcome_text, prompt
 from service.room.proposals import ProposalBook
 from service.room.state import (
     AcquisitionState,
@@ -94,7 +94,7 @@ class Describer:
                 "ready": arrival is not None,
                 "ready_lost": _lost_ready(found),
                 "arrival": arrival,
-                "punctured": found is not None and _punctured(record, found.procedure_id),
+                "punctured": found is not None and is_punctured(record, found.procedure_id),
                 "robot": describe_robot(link, before.robot),
                 "jog_possible": may_start(record, now) is None,
                 "hold": _hold(record),
@@ -284,11 +284,6 @@ def _timeless(state: RoomState) -> RoomState:
     parts = {name: getattr(state, name) for name in ("measurement", "arrival")}
     younger = {name: part and part.model_copy(update=ageless) for name, part in parts.items()}
     return state.model_copy(update={"at_s": 0.0, "revision": 0, **younger})
-
-
-def _punctured(record: CaseRecord, procedure_id: int) -> bool:
-    puncture = record.last_event("puncture")
-    return puncture is not None and puncture.body["procedure_id"] == procedure_id
 
 
 def _clock(config: Config, record: CaseRecord) -> ClockState | None:
