@@ -30,10 +30,14 @@ function closeUp(error, toleranceMm, covariance) {
 
 const row = (name, value, title) => h("tr", { title }, h("th", { scope: "row" }, name), h("td", {}, value));
 
-// With two fiducials it is the needle's tip that is steered, and its distance is known at READY.
-function tipError(arrival) {
-  const [row_mm, col_mm] = arrival.tip_error_mm;
-  return { row_mm, col_mm, error_mm: arrival.error_mm, sigma_mm: arrival.sigma_mm };
+// With two fiducials it is the needle's tip that is steered: its distance at READY, or before a move.
+function tipError(arrival, plan) {
+  if (arrival?.tip_error_mm) {
+    const [row_mm, col_mm] = arrival.tip_error_mm;
+    return { row_mm, col_mm, error_mm: arrival.error_mm, sigma_mm: arrival.sigma_mm };
+  }
+  const tip = plan?.parts?.find((part) => part.name === "tip");
+  return tip ? { ...tip, error_mm: Math.hypot(tip.row_mm, tip.col_mm), probability_within_tolerance: NaN } : null;
 }
 
 function rowsOf(measurement) {
@@ -46,14 +50,15 @@ function rowsOf(measurement) {
   ].filter(Boolean);
 }
 
-export const drawNumbers = whenChanged(({ error: ofFiducial, measurement, tolerance_mm, arrival, slice, guide, reason }) => {
+export const drawNumbers = whenChanged(({ error: ofFiducial, measurement, tolerance_mm, arrival, slice, guide, reason, plan }) => {
   const body = byId("error-body");
-  const ofTip = arrival?.tip_error_mm ? tipError(arrival) : null;
+  const ofTip = guide ? tipError(arrival, plan) : null;
   const error = guide ? ofTip : ofFiducial;
   setText(byId("h-error"), guide ? words.tipHeading : words.heading);
   const rows = rowsOf(measurement);
   if (!error) {
-    const why = reason || (measurement?.state === "failed" ? words.noFiducial(measurement.reason) : guide ? words.atReady : words.nothing);
+    const failed = measurement?.state === "failed" ? words.noFiducial(measurement.reason) : "";
+    const why = failed || (guide ? words.atReady : reason || words.nothing);
     replace(body, h("p", { class: "big quiet" }, NONE, h("small", {}, " mm")), h("p", { class: "quiet" }, why),
       rows.length ? h("table", {}, h("tbody", {}, rows)) : null);
     return;
@@ -67,10 +72,10 @@ export const drawNumbers = whenChanged(({ error: ofFiducial, measurement, tolera
       h("div", {},
         h("p", { class: `big ${inside ? "inside" : "outside"}` }, mm(shown.error_mm, shown.error_mm < 10 ? 3 : 2), h("small", {}, " mm")),
         h("p", { class: "pm" }, `± ${mm(shown.sigma_mm, 3)} mm`, h("small", { class: "quiet" }, ` ${words.sigma}`))),
-      closeUp(error, tolerance_mm, ofTip ? arrival.tip_covariance_mm2 : measurement?.covariance_mm2)),
+      closeUp(error, tolerance_mm, ofTip ? arrival?.tip_covariance_mm2 : measurement?.covariance_mm2)),
     h("p", { class: "quiet" }, where),
     h("table", {}, h("tbody", {},
-      row(words.within(mm(tolerance_mm, 3)), percent(chance), words.withinTitle),
-      ofTip ? row(words.tipBelow, `${mm(arrival.tip_below_joint_mm, 1)} mm`) : null,
+      Number.isFinite(chance) ? row(words.within(mm(tolerance_mm, 3)), percent(chance), words.withinTitle) : null,
+      ofTip && arrival ? row(words.tipBelow, `${mm(arrival.tip_below_joint_mm, 1)} mm`) : null,
       ...rows)));
 });

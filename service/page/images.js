@@ -66,7 +66,7 @@ export class Images {
     this.ageText = h("span", { id: "image-age" });
     this.source = h("span", {});
     replace(this.root, bar,
-      h("div", { class: "stage" }, strip, h("div", { class: "views" }, this.slice.root, this.sr.root)),
+      h("div", { class: "stage" }, strip, h("div", { class: "views" }, this.slice.root, this.sr.root, h("section", { id: "needle", class: "view", "aria-labelledby": "h-needle", hidden: true }))),
       h("div", { class: "read" }, this.ageText, this.source, this.cursor));
     this.list = new SliceList(strip, (row) => this.choose(row));
   }
@@ -75,14 +75,26 @@ export class Images {
     this.layout = layout;
     this.buttons.forEach((button, k) => button.setAttribute("aria-pressed", String(LAYOUTS[k] === layout)));
     this.slice.root.hidden = layout === "reconstruction";
-    this.sr.root.hidden = layout === "slice" || layout === "blend";
+    this.placeViews();
     this.shareLabel.hidden = layout !== "blend";
     this.repaint();
+  }
+
+  // With two fiducials there is no reconstruction as a rule: beside the slice stands the needle then.
+  showsNeedle() {
+    return Boolean(this.state?.guide && !this.state.reconstruction && this.layout === "both");
+  }
+
+  placeViews() {
+    this.sr.root.hidden = this.layout === "slice" || this.layout === "blend" || this.showsNeedle();
+    const needle = this.root.querySelector("#needle");
+    if (needle) needle.hidden = !this.showsNeedle();
   }
 
   draw(state, role) {
     const before = this.state?.slice?.slice_id;
     this.state = state;
+    this.placeViews();
     // a new slice is what matters: it is shown, unless somebody picks on an older one just now
     if (before && state.slice?.slice_id !== before && !this.picking.isOn) this.chosen = null;
     this.newest.hidden = !this.chosen;

@@ -39,8 +39,8 @@ function draw(state) {
   drawHead(state, page.connected);
   next.draw(state, page.role);
   images.draw(state, page.role);
-  drawNumbers({ error: state.error, measurement: state.measurement, tolerance_mm: state.tolerance_mm, arrival: state.arrival, slice: state.slice, guide: state.guide, reason: state.error_reason });
-  drawNeedle({ guide: state.guide, entry: state.entry_patient_mm, target: state.target_patient_mm, fiducials: belief?.fiducials ?? [], arrival: state.arrival });
+  drawNumbers({ error: state.error, measurement: state.measurement, tolerance_mm: state.tolerance_mm, arrival: state.arrival, slice: state.slice, guide: state.guide, reason: state.error_reason, plan: question?.plan ?? null });
+  drawNeedle({ guide: state.guide && images.showsNeedle(), entry: state.entry_patient_mm, target: state.target_patient_mm, fiducials: belief?.fiducials ?? [], arrival: state.arrival });
   drawStages({ robot: { travel_um: robot.travel_um, positions_um: robot.positions_um, position_certain: robot.position_certain }, plan: question?.plan });
   drawAlarms(state.alarms ?? []);
   drawProposals({ proposals: state.proposals ?? [], role: page.role });

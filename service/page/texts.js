@@ -48,20 +48,19 @@ export const TEXTS = {
   plan: {
     row: "row", col: "column", picture: "The move as seen in the slice",
     parts: { upper: "Upper fiducial", lower: "Lower fiducial", tip: "Needle tip" },
-    distance: "Distance to target before this move",
-    beforeMove: "is off by",
+    distance: "Off by, before this move",
   },
 
   distance: {
     heading: "Distance to target", tipHeading: "Distance from needle tip to target", sigma: "(1 σ)",
     closeUp: (mm) => `Close-up: the fiducial is ${mm} mm from the target`,
-    noFiducial: (why) => `No fiducial found: ${why}`, atReady: "Known once the needle guide has arrived.", nothing: "No target or no measurement yet.",
+    noFiducial: (why) => `No fiducial found: ${why}`, atReady: "Known when the next move is planned, and at READY.", nothing: "No target or no measurement yet.",
     lies: (where) => `The target lies ${where}.`, liesByNewest: (where) => `By the newest slices alone the target lies ${where}.`,
     within: (mm) => `Probability within ${mm} mm`, withinTitle: "that the true distance is below the tolerance",
     tipBelow: "Tip below lower joint", slices: "Slices", snr: "Signal to noise", chi2: "χ² per degree of freedom", method: "Method",
   },
   needle: {
-    heading: "View along the slices: needle and target", picture: "Needle line, entry point, target and fiducials seen from the side",
+    heading: "Needle and target from the side", picture: "Needle line, entry point, target and fiducials seen from the side",
     front: "A", back: "P", entry: "entry", target: "target", upper: "upper", lower: "lower", tip: "tip", nothing: "Set an entry point and a target.",
   },
 
@@ -89,7 +88,7 @@ export const TEXTS = {
     heading: "Slices of this case", newer: "Newer slices", older: "Older slices", empty: "No slices.",
     kinds: { assigned: "used", pending: "waiting", aside: "set aside", planning: "planning" },
     position: (side, mm) => `${side} ${mm}`,
-    show: (id, kind, where) => `Show slice ${id}, ${kind}${where ? `, ${where}` : ""}`,
+    show: (id, kind, where) => `${id} ${kind}${where ? ` ${where}` : ""}: show this slice`,
   },
 
   pick: {
@@ -126,11 +125,11 @@ export const TEXTS = {
   },
   targets: {
     heading: "Targets of this case", columns: ["Target", "Patient mm (LPS)", "Approaches", ""], none: "None yet.", current: "current", again: "Use again",
-    againLabel: (name) => `Use target ${name} again`, tissue: " (in tissue)",
+    againLabel: (name) => `Use again: target ${name}`, tissue: " (in tissue)",
   },
   past: {
     heading: "Cases", columns: ["Case", "Begun", "Slices", "Measured", "Punctures", "Documents"], none: "None.",
-    report: "report", zip: "zip", reportOf: (name) => `Report of ${name}`, exportOf: (name) => `Export of ${name}`,
+    report: "report", zip: "zip", reportOf: (name) => `Report of ${name}`, exportOf: (name) => `zip: export of ${name}`,
   },
   clock: {
     heading: "Scanner clock",

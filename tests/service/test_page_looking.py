@@ -173,7 +173,7 @@ def test_a_target_of_before_is_taken_again_by_clicking(
     client.set_target((first[0], first[1], first[2]), label="the first")
     client.set_target((second[0], second[1], second[2]), label="the second")
     expect(page.locator("#targets tr", has_text="the second")).to_contain_text("current")
-    page.get_by_role("button", name="Use target the first again").click()
+    page.get_by_role("button", name="Use again: target the first").click()
     wait_for(client.state, lambda s: s.target_patient_mm == pytest.approx(first))
     client.withdraw_target()
 
