@@ -12,14 +12,17 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import structlog
 
+from case_record.attempts import MOST_DEATHS, Attempts
 from case_record.cases import Cases
 from case_record.presence import Presence, Sole
-from case_record.record import CaseRecord
+from case_record.record import CaseRecord, CaseRecordError
 from dicom_listener.assign import AssignRules
-from dicom_listener.clock import ClockRules, Sync
+from dicom_listener.clock import ClockRules, Comparison, Promptness
+from dicom_listener.holding_area import INBOX
 from dicom_listener.inbox import Inbox
-from dicom_listener.intake import Intake, IntakeRules
+from dicom_listener.intake import IntakeRules
 from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.reception import Reception
 from dicom_listener.retention import remove_old
 from dicom_listener.scp import Scp, ScpRules, tls_context
 from dicom_slice.usable import SliceRules
@@ -44,12 +47,16 @@ class Ready:
     ae_title: str
 
 
+class ListeningEndedError(RuntimeError):
+    """Nothing is received any more: the process ends, so that it is started again."""
+
+
 class PortError(ConfigError):
     """The port cannot be bound: most often another process has it."""
 
 
-def inbox_folder(case_dir: Path) -> Path:
-    return case_dir / "inbox"
+def inbox_folder(home: Path) -> Path:
+    return home / INBOX
 
 
 def scp_rules(config: ListenerConfig) -> ScpRules:
@@ -69,11 +76,8 @@ def scp_rules(config: ListenerConfig) -> ScpRules:
     )
 
 
-def intake_rules(config: Config, now_s: float) -> IntakeRules:
+def intake_rules(config: Config) -> IntakeRules:
     listener = config.listener
-    sync = None
-    if listener.clock_offset_s is not None:
-        sync = Sync(listener.clock_offset_s, listener.clock_uncertainty_s, now_s)
     return IntakeRules(
         slices=SliceRules(
             coronal_tolerance_deg=config.imaging.coronal_tolerance_deg,
@@ -86,13 +90,30 @@ def intake_rules(config: Config, now_s: float) -> IntakeRules:
             arrival_mode=listener.arrival_mode,
         ),
         clock=ClockRules(
-            prompt_delay_s=listener.prompt_delay_s,
+            promptness=_promptness(listener),
             longest_acquisition_s=listener.longest_acquisition_s,
-            largest_offset_s=listener.largest_clock_offset_s,
             late_limit_s=listener.late_limit_s,
+            comparison_valid_s=60 * listener.comparison_valid_min,
         ),
         zone=_zone(listener.scanner_time_zone),
-        sync=sync,
+        comparison=_comparison(listener),
+    )
+
+
+def _promptness(listener: ListenerConfig) -> Promptness | None:
+    if listener.prompt_delay_s is None:
+        return None
+    return Promptness(listener.least_delay_s, listener.prompt_delay_s)
+
+
+def _comparison(listener: ListenerConfig) -> Comparison | None:
+    """As the room's file states it, made when the file says (`load_config` sees to that)."""
+    if listener.clock_offset_s is None or listener.clock_compared_at is None:
+        return None
+    return Comparison(
+        listener.clock_offset_s,
+        listener.clock_uncertainty_s,
+        listener.clock_compared_at.timestamp(),
     )
 
 
@@ -132,14 +153,15 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
     received: SimpleQueue[Path] = SimpleQueue()
     metrics = ListenerMetrics()
     with ExitStack() as stack:
-        case_dir = Cases(*config.room.folders).required()
-        stack.enter_context(Sole(case_dir, "listener"))
-        record = stack.enter_context(CaseRecord(case_dir, create=True))
+        cases = Cases(*config.room.folders)
+        stack.enter_context(Sole(cases.home, "listener"))
+        if cases.only is not None:
+            CaseRecord(cases.only, create=True).close()
         inbox = Inbox(
-            inbox_folder(case_dir),
+            inbox_folder(cases.home),
             min_free_bytes=config.listener.min_free_mib * _MIB,
         )
-        rules = intake_rules(config, time.time())
+        rules = intake_rules(config)
         scp = open_scp(config.listener, inbox, metrics, received.put)
         stack.callback(scp.stop)
         discarded = inbox.discard_unfinished()
@@ -153,50 +175,56 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         scp.start()
         on_ready(Ready(scp.port, metrics_port, config.listener.ae_title))
         # Receiving needs no memory of the case: a long record must not keep a scanner waiting.
-        intake = Intake(record, inbox, rules, metrics)
-        stack.callback(intake.close)
+        reception = Reception(cases, inbox, rules, metrics)
+        stack.callback(reception.close)
+        reception.follow()
         if discarded:
-            intake.alarm("unfinished_files", f"{discarded} unanswered files of an earlier run")
-        left_over = intake.left_over()
-        for path in left_over:
-            received.put(path)
-        log.info("serving", port=scp.port, left_over=len(left_over))
-        presence = stack.enter_context(Presence(case_dir, "listener"))
+            text = f"{discarded} unanswered files of an earlier run"
+            reception.alarm("unfinished_files", text)
+        log.info("serving", port=scp.port, left_over=_requeue(reception, received))
+        presence = stack.enter_context(Presence(cases.home, "listener"))
         retention_s = config.listener.retention_days * 86400
-        tending = Tending(record, inbox, intake, retention_s)
-        _loop(intake, scp, tending, received, stop, presence)
+        tending = Tending(inbox, reception, retention_s)
+        attempts = stack.enter_context(Attempts(cases.home, "listener"))
+        _loop(reception, scp, tending, received, stop, presence, attempts)
 
 
 def _loop(
-    intake: Intake,
+    reception: Reception,
     scp: Scp,
     tending: "Tending",
     received: "SimpleQueue[Path]",
     stop: threading.Event,
     presence: Presence,
+    attempts: Attempts,
 ) -> None:
     while not stop.is_set():
         presence.beat()
+        if not scp.is_listening:
+            raise ListeningEndedError("the thread that listens on the port has ended")
         try:
-            _take_received(intake, received)
-            intake.look_at_record()
+            if reception.follow():
+                _requeue(reception, received)
+            _take_received(reception, received, attempts)
+            reception.turn()
             while scp.alarms:
-                intake.note_alarm(*scp.alarms.popleft())
+                reception.note_alarm(*scp.alarms.popleft())
             tending.turn()
-        except sqlite3.Error as error:
+        except (CaseRecordError, sqlite3.Error, OSError) as error:
             # The slices are safe in the inbox: tried again until the record can be written.
             log.error("the case record cannot be written", error=str(error))
             stop.wait(_RECORD_RETRY_S)
-            _requeue(intake, received)
+            _requeue(reception, received)
+        except Exception:  # receiving and storing go on, whatever the rest of the loop meets
+            log.exception("the listener's loop")
+            stop.wait(_RECORD_RETRY_S)
 
 
 class Tending:
     """What is looked after now and then, in the listener's own loop: disk and retention."""
 
-    def __init__(
-        self, record: CaseRecord, inbox: Inbox, intake: Intake, retention_s: float
-    ) -> None:
-        self._record, self._inbox, self._intake = record, inbox, intake
+    def __init__(self, inbox: Inbox, reception: Reception, retention_s: float) -> None:
+        self._inbox, self._reception = inbox, reception
         self._retention_s = retention_s
         self._disk_at_s = self._removal_at_s = 0.0
         self._was_low = False
@@ -208,28 +236,43 @@ class Tending:
             self._look_at_disk()
         if now_s >= self._removal_at_s:
             self._removal_at_s = now_s + _REMOVAL_S
-            remove_old(self._record, self._retention_s, time.time())
+            if self._reception.record is not None:
+                remove_old(self._reception.record, self._retention_s, time.time())
 
     def _look_at_disk(self) -> None:
         """Alarm, once, before the disk is so full that slices are refused."""
         free_bytes = self._inbox.free_bytes()
         is_low = free_bytes < 2 * self._inbox.min_free_bytes
         if is_low and not self._was_low:
-            self._intake.alarm("disk_low", f"{free_bytes // _MIB} MiB free")
+            self._reception.alarm("disk_low", f"{free_bytes // _MIB} MiB free")
         self._was_low = is_low
 
 
-def _requeue(intake: Intake, received: "SimpleQueue[Path]") -> None:
-    for path in intake.left_over():
+def _requeue(reception: Reception, received: "SimpleQueue[Path]") -> int:
+    """What has not found its place yet, anew; return how many they are."""
+    left_over = reception.left_over()
+    for path in left_over:
         received.put(path)
+    return len(left_over)
 
 
-def _take_received(intake: Intake, received: "SimpleQueue[Path]") -> None:
+def _take_received(reception: Reception, received: "SimpleQueue[Path]", attempts: Attempts) -> None:
     """Wait for at most one poll, then take whatever is there."""
     try:
         path = received.get(timeout=_POLL_S)
         while True:
-            intake.take(path)
+            _take(reception, path, attempts)
             path = received.get_nowait()
     except Empty:
         return
+
+
+def _take(reception: Reception, path: Path, attempts: Attempts) -> None:
+    """One file; one over which the listener was killed again and again is not read any more."""
+    deaths = attempts.deaths(path.name)
+    if deaths >= MOST_DEATHS:
+        reception.set_aside(path, f"the listener ended {deaths} times while it read this file")
+        attempts.forget(path.name)
+        return
+    with attempts.at(path.name):
+        reception.take(path)

@@ -46,7 +46,7 @@ function draw(state) {
   drawProposals({ proposals: state.proposals ?? [], role: page.role });
   drawJog({ positions_um: robot.positions_um, possible: page.role === "operator" && state.jog_possible });
   drawCase({ description: state.case, case_uid: state.case_uid, role: page.role });
-  drawScannerClock({ clock: state.clock, role: page.role });
+  drawScannerClock({ clock: state.clock, clock_implies: state.clock_implies, role: page.role });
   drawParts({ robot: { linked: robot.linked, boot_id: robot.boot_id, problem: robot.problem }, processes: state.processes, slices: state.slices });
   if (belief) drawBelief({ ...belief, settings: page.role === "operator" ? belief.settings : null });
   newAside([state.slices.quarantined, state.hold?.hold_id, page.role]);

@@ -4,14 +4,14 @@
 import { order } from "./api.js";
 import { byId, h, replace, setText, whenChanged } from "./dom.js";
 import { act } from "./actions.js";
-import { day } from "./format.js";
+import { age, day } from "./format.js";
 import { TEXTS } from "./texts.js";
 
 const { clock: words } = TEXTS;
 
 const DAY_S = 86400;
-// a person presses within this of the second that is shown (1 sigma of eye and hand, and its rounding)
-const UNCERTAINTY_S = 0.5;
+// a person presses within this of the second that is shown: its rounding, and the time to react
+const UNCERTAINTY_S = 1.0;
 
 const heardS = [];
 
@@ -20,6 +20,15 @@ const heardS = [];
 export function heardFromRoom(nowS) {
   heardS.push(nowS - Date.now() / 1000);
   if (heardS.length > 50) heardS.shift();
+}
+
+const nowS = () => Date.now() / 1000 + roomMinusBrowserS();
+
+// An age goes on by itself: nothing else on the card is drawn anew for it.
+function ageOf(instantS) {
+  const text = h("span", { id: "clock-age" }, age(nowS() - instantS));
+  const timer = setInterval(() => (text.isConnected ? setText(text, age(nowS() - instantS)) : clearInterval(timer)), 5000);
+  return text;
 }
 
 const roomMinusBrowserS = () => (heardS.length ? Math.max(...heardS) : 0);
@@ -46,10 +55,10 @@ function inWords(offset) {
   return (offset < 0 ? words.ahead : words.behind)(Math.abs(offset).toFixed(1));
 }
 
-export const drawScannerClock = whenChanged(({ clock, role }) => {
+export const drawScannerClock = whenChanged(({ clock, clock_implies, role }) => {
   const known = clock
-    ? words.known(inWords(clock.offset_s), clock.uncertainty_s, clock.compared_s ? words.compared(day(clock.compared_s), clock.who) : words.configured)
-    : words.unknown;
+    ? [words.known(inWords(clock.offset_s), clock.uncertainty_s, words.compared(day(clock.compared_s), clock.who)), " (", ageOf(clock.compared_s), ` ${words.ago}). ${clock_implies}`]
+    : [clock_implies];
   const input = h("input", { id: "scanner-shows", placeholder: "hh:mm:ss", inputMode: "numeric", autocomplete: "off", size: 9, disabled: role !== "operator" });
   const said = h("p", { class: "quiet", role: "status" });
   let offset = NaN;
@@ -67,6 +76,6 @@ export const drawScannerClock = whenChanged(({ clock, role }) => {
     type: "button", disabled: role !== "operator", title: words.forgetTitle,
     onclick: () => act(() => order("POST", "api/v1/clock/reset", { why: words.why })),
   }, words.forget);
-  replace(byId("scanner-clock"), h("p", { class: "quiet" }, known),
+  replace(byId("scanner-clock"), h("p", { class: "quiet" }, ...known),
     h("p", { class: "row" }, h("label", { htmlFor: "scanner-shows" }, words.reads), input, compare), said, use, clock ? h("p", {}, forget) : null);
 });

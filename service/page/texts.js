@@ -134,11 +134,10 @@ export const TEXTS = {
   clock: {
     heading: "Scanner clock",
     same: "agrees with the room clock", ahead: (s) => `is ${s} s ahead of the room clock`, behind: (s) => `is ${s} s behind the room clock`,
-    known: (words, s, who) => `The scanner clock ${words}, ± ${s} s; ${who}.`, compared: (when, who) => `compared ${when} by ${who}`, configured: "as configured",
-    unknown: "Not compared yet: it is estimated from the slices as they arrive.",
+    known: (words, s, who) => `The scanner clock ${words}, ± ${s} s; ${who}`, compared: (when, who) => `compared ${when} by ${who}`, ago: "ago",
     reads: "Scanner clock reads", now: "Scanner clock reads this now", then: (words) => `The scanner clock ${words}.`,
     bad: "Type what the scanner clock reads, for example 10:32:07.", use: "Use this", forget: "The scanner clock was changed: forget this",
-    forgetTitle: "It is then estimated again from the next slices, which must arrive promptly.", why: "said on the page",
+    forgetTitle: "Slices wait until the clocks are compared again.", why: "said on the page",
   },
   system: {
     heading: "System", service: "Service", robot: "Robot", slices: "Slices", none: "none", linked: (boot) => `linked, session ${boot}`,
