@@ -10,7 +10,7 @@ from case_record.rows import Event
 from service.cli.report_html import html_table, number_text, time_text
 from service.procedure.registry import APPROACHES
 from service.procedure.targets import Target, all_targets
-from service.room.case_settings import SETTINGS_CHANGED
+from service.room.belief.goal import SETTINGS_CHANGED
 
 _LISTENER = "listener"
 

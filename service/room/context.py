@@ -16,7 +16,7 @@ from service.procedure.fiducial_plan import gate_of
 from service.procedure.plan import Travel
 from service.procedure.registry import latest_calibration
 from service.procedure.start_point import start_point
-from service.room.case_settings import effective
+from service.room.belief.goal import effective
 from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.motion_allowed import may_start

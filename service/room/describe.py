@@ -13,9 +13,9 @@ from case_record.rows import Measurement, SliceRow
 from room_config.load import Config
 from service.procedure.targets import current_entry, current_target
 from service.room.alarms import AlarmBook, Condition
-from service.room.belief import describe_belief
-from service.room.belief_state import BeliefState
-from service.room.case_settings import effective, goal_tolerance_mm
+from service.room.belief.describe import describe_belief
+from service.room.belief.goal import effective, goal_tolerance_mm
+from service.room.belief.state import BeliefState
 from service.room.conditions import HANGS, conditions
 from service.room.context import now_of
 from service.room.describe_measurement import (

@@ -9,7 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from room_config.load import Config
-from service.room.belief_state import BeliefState
+from service.room.belief.state import BeliefState
 from service.room.proposals import ProposalState
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from room_config.service import STRATEGIES
-from service.room.case_settings import SETTINGS_CHANGED, bounds_of
+from service.room.belief.goal import SETTINGS_CHANGED, bounds_of
 from service.room.context import Room
 from service.room.readiness import ConflictError
 

@@ -1,4 +1,4 @@
-"""The values in which `service.room.belief` says what the system believes."""
+"""The values in which `service.room.belief.describe` says what the system believes."""
 
 from __future__ import annotations
 

@@ -20,7 +20,8 @@ from service.procedure.registry import (
     latest_calibration,
 )
 from service.procedure.steering import frames_that_decide
-from service.room.belief_state import (
+from service.room.belief.goal import bounds_of, effective, goal_tolerance_mm
+from service.room.belief.state import (
     AxisBelief,
     BeliefState,
     CalibrationBelief,
@@ -29,7 +30,6 @@ from service.room.belief_state import (
     HoldBelief,
     SettingsBounds,
 )
-from service.room.case_settings import bounds_of, effective, goal_tolerance_mm
 from sr_engine.reconstruction.shiftset import named
 
 _SAME_SLICE_MM = 0.5
