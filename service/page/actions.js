@@ -13,7 +13,8 @@ const READ_FIRST_MS = 700;
 
 const post = (path, body) => () => order("POST", `api/v1/${path}`, body);
 
-// Which actions make sense now. The first one that is possible is the large button.
+// Which actions make sense now. The first one that is possible is the large button, if it is what the
+// prompt asks for (aside: it is not).
 export function actionsFor(state) {
   const { robot } = state;
   const idle = !state.procedure;
@@ -28,8 +29,10 @@ export function actionsFor(state) {
   } else {
     add(words.needleOut, post("needle-out"), robot.linked && robot.insertion_locked);
   }
-  add(words.approach, post("approach"), free && state.calibrated && state.target_patient_mm && (!state.guide || state.entry_patient_mm));
-  add(words.calibrate, post("calibration"), free);
+  const planned = state.target_patient_mm && (!state.guide || state.entry_patient_mm);
+  add(words.approach, post("approach"), free && state.calibrated && planned);
+  add(words.pick, "pick", free && state.calibrated && !planned && state.slice);
+  add(words.calibrate, post("calibration"), free, { aside: state.calibrated });
   add(words.targetHere, post("target/here"), free && state.calibrated && !state.guide);
   const wanted = state.acquisition_request;
   add(words.acquired(wanted?.hold_id), post("acquisition", { hold_id: wanted?.hold_id }), state.arrival_mode && wanted);
@@ -49,7 +52,9 @@ const drawChips = whenChanged((robot) => {
 });
 
 export class Next {
-  constructor() {
+  // onPick: begins to pick a target on the slice
+  constructor(onPick) {
+    this.onPick = onPick;
     this.drawActions = whenChanged((key, state) => this.actions(state));
     this.drawQuestion = whenChanged((question, state) => this.question(question, state));
     this.mayAct = true;
@@ -72,7 +77,7 @@ export class Next {
   actions(state) {
     const list = state.question ? actionsFor(state).filter((a) => a.label === words.abort) : actionsFor(state);
     replace(byId("actions"), list.map((action, place) => h("button", {
-      type: "button", class: place === 0 && !state.procedure ? "main" : null, disabled: !this.mayAct,
+      type: "button", class: place === 0 && !state.procedure && !action.aside ? "main" : null, disabled: !this.mayAct,
       title: this.mayAct ? null : words.viewersOnly,
       onclick: () => this.run(action.run),
     }, action.label)));
@@ -80,6 +85,7 @@ export class Next {
 
   run(what) {
     if (what === "puncture") return this.askDepth();
+    if (what === "pick") return this.onPick();
     return act(what);
   }
 

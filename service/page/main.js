@@ -21,7 +21,7 @@ import { TEXTS } from "./texts.js";
 
 const page = { state: null, role: "viewer", measurements: [], connected: false };
 const images = new Images(byId("images"));
-const next = new Next();
+const next = new Next(() => images.picking.toggle());
 
 const HEADINGS = {
   "h-alarms": TEXTS.alarms, "h-belief": TEXTS.belief, "h-history": TEXTS.history, "h-stages": TEXTS.stages, "h-events": TEXTS.events,
