@@ -1,7 +1,7 @@
 """What every driver of motors must do: the seam `Motors` (`robot_bridge/daemon/motors.py`), tried.
 
-`check_motors` drives two axes by up to 0.6 mm from where they stand, and back. Give it a driver that
-is not open yet, on a bench, with nothing in the way.
+`check_motors` drives two axes by up to 0.6 mm from where they stand, and back. Give it a driver
+that is not open yet, on a bench, with nothing in the way.
 """
 
 import contextlib
