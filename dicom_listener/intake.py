@@ -28,6 +28,7 @@ from dicom_listener.assign import (
 )
 from dicom_listener.case_gate import CaseGate
 from dicom_listener.clock import ClockRules, Comparison
+from dicom_listener.copies import what_it_is
 from dicom_listener.holding_area import INBOX, Arrival
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope
 from dicom_listener.metrics import ListenerMetrics
@@ -169,7 +170,7 @@ class Intake:
         # a sync or reset that was recorded before this slice came must count for it
         self._read_events(replaying=False)
         try:
-            rows, slices = self._rows_of(path, name, envelope, conflict=bool(before))
+            rows, slices = self._rows_of(path, name, envelope, before)
         except sqlite3.Error:
             raise
         except Exception as error:  # a fault of ours must not stop the slices behind this one
@@ -235,7 +236,7 @@ class Intake:
         self._event("duplicate_slice", {"sop_instance_uid": envelope.sop_instance_uid})
 
     def _rows_of(
-        self, path: Path, name: str, envelope: Envelope, conflict: bool
+        self, path: Path, name: str, envelope: Envelope, before: Sequence[SliceRow]
     ) -> tuple[list[NewSlice], list[Slice | None]]:
         try:
             slices = self._read(path, envelope)
@@ -248,8 +249,11 @@ class Intake:
             for kind, text in self._clocks.observe(slice_, envelope.received_s):
                 self.alarm(kind, text)
         rows: list[NewSlice] = []
+        known = None
+        if before:
+            known = what_it_is(self._record, self._decoder, path, slices, before)
         for slice_ in slices:
-            against = self._against(slice_, envelope, problems, conflict)
+            against = known or self._against(slice_, envelope, problems)
             decision = against or self._assign(slice_, envelope.received_s, self._known_now(rows))
             arrival_mode = self._rules.assign.arrival_mode
             rows.append(row_of(slice_, envelope, name, decision, arrival_mode=arrival_mode))
@@ -263,12 +267,7 @@ class Intake:
         slice_: Slice,
         envelope: Envelope,
         problems: dict[int, UnusableError],
-        conflict: bool,
     ) -> SetAside | None:
-        if conflict:
-            return SetAside(
-                Reason.UID_CONFLICT, "an instance with this UID and other bytes is already here"
-            )
         stated = slice_.sop_instance_uid
         if stated and stated != envelope.sop_instance_uid:
             return SetAside(
