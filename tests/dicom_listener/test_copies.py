@@ -64,11 +64,11 @@ def _brighter(data: Dataset) -> None:
     data.PixelData = pixels.tobytes()
 
 
-def _later(data: Dataset) -> None:
-    data.AcquisitionDateTime = "20200102030405"
+def _longer(data: Dataset) -> None:
+    data.AcquisitionDuration = 0.7
 
 
-@pytest.mark.parametrize("change", [_moved, _brighter, _later])
+@pytest.mark.parametrize("change", [_moved, _brighter, _longer])
 def test_anything_else_under_a_known_uid_is_an_alarm(desk, change):
     first = noisy()
     other = copy.deepcopy(first)
