@@ -32,6 +32,7 @@ from dicom_listener.copies import what_it_is
 from dicom_listener.holding_area import INBOX, Arrival
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope
 from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.plans import PLAN_RECEIVED, plan_event
 from dicom_listener.scanner_clocks import ScannerClocks
 from dicom_listener.slice_rows import (
     outcome_of,
@@ -185,6 +186,7 @@ class Intake:
             return
         self._gate.bring_in(path)
         self._write(rows, slices, envelope)
+        self._note_plan(path, rows, envelope)
         self._done.add(name)
         self._decide_pending()
         self._metrics.intake_seconds.observe(max(0.0, time.time() - envelope.received_s))
@@ -317,6 +319,15 @@ class Intake:
             self._note_use(slice_, row.hold_id)
         if any(row.reason_code == Reason.UID_CONFLICT for row in rows):
             self.alarm("same_uid_other_bytes", f"{envelope.sop_instance_uid}: both are kept")
+
+    def _note_plan(self, path: Path, rows: list[NewSlice], envelope: Envelope) -> None:
+        """What is no image may be somebody's plan: the service puts it before the operator."""
+        if rows[0].reason_code != Reason.NOT_MR:
+            return
+        here = self._record.case_dir / rows[0].path
+        plan = plan_event(self._record, here if here.exists() else path, envelope)
+        if plan is not None:
+            self._event(PLAN_RECEIVED, plan)
 
     def _note_use(self, slice_: Slice, hold_id: int | None) -> None:
         if hold_id is not None:
