@@ -375,7 +375,7 @@ def test_a_plan_by_dicom_is_a_proposal_like_the_others(room, port):
         workstation = AE("WORKSTATION")
         workstation.add_requested_context(SpatialFiducialsStorage)
         listener = room.virtual_table["scanner"]["listener_port"]
-        association = workstation.associate("127.0.0.1", listener)
+        association = workstation.associate("127.0.0.1", listener, ae_title="AUTOSPINE")
         for uid in ("1.2.3.4", frame):
             sent = association.send_c_store(spatial_fiducials(study, uid, place))
             assert sent.Status == 0
