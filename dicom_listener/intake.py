@@ -305,7 +305,7 @@ class Intake:
         )
 
     def _holds(self) -> list[HoldWindow]:
-        holds = self._record.holds()[-_HOLDS_LOOKED_AT:]
+        holds = self._record.newest_holds(_HOLDS_LOOKED_AT)
         return [window_of(hold, hold.hold_id in self._confirmed) for hold in holds]
 
     def _write(self, rows: list[NewSlice], slices: list[Slice | None], envelope: Envelope) -> None:
