@@ -33,7 +33,8 @@ _CLOCK_OFFSET_S = 37.2
 class DemoOptions:
     """What the user chose; port 0 means any free one.
 
-    tokens: the room asks for tokens. guide: two fiducials and four axes.
+    tokens: the room asks for tokens. guide: two fiducials and four axes. attended: a person
+    operates it on the page, which asks before every move.
     """
 
     case_dir: Path
@@ -44,6 +45,7 @@ class DemoOptions:
     speed_factor: float = 3.0
     tokens: bool = False
     guide: bool = False
+    attended: bool = False
 
 
 class PortInUseError(Exception):
@@ -74,6 +76,11 @@ class DemoRoom:
     def truth_file(self) -> Path:
         return self.virtual_dir / "acquisitions.jsonl"
 
+    @property
+    def faults_file(self) -> Path:
+        """Names of the faults that are switched on just now."""
+        return self.virtual_dir / "faults-now"
+
     def start(self) -> None:
         """Start all processes; ChildError if one does not come up. Call `end` in any case."""
         motors = self.family.start("motors", self._motors_words())
@@ -86,6 +93,9 @@ class DemoRoom:
         self.url = str(self.family.start("service", autospine("service", *here))["url"])
         for child in slow:
             child.wait_ready(120.0)
+        self._start_scanner(here)
+
+    def _start_scanner(self, here: list[str]) -> None:
         self.family.start("scanner", autospine("scanner", *here))
 
     def check(self) -> None:
@@ -159,6 +169,7 @@ class DemoRoom:
                 "motors_truth_port": self.truth_port,
                 "truth_file": str(self.truth_file),
                 "clock_offset_s": _CLOCK_OFFSET_S,
+                **({"faults_file": str(self.faults_file)} if self.options.attended else {}),
                 **({"token_file": str(self._token_file)} if self.options.tokens else {}),
             },
         }
@@ -187,7 +198,7 @@ class DemoRoom:
             "service": {
                 "port": page_port,
                 "bridge_link": str(line),
-                "confirm_moves": False,
+                "confirm_moves": self.options.attended,
                 # more than the guard and what the prompt delay leaves open of the clock
                 "settle_s": 0.25,
                 "rescan_after_s": 6.0,
@@ -203,6 +214,7 @@ class DemoRoom:
         }
         if self.options.guide:
             tables["service.guide"] = _guide_table(virtual)
+        self._adapt(tables)
         axes = [self._axis_table(name, number) for number, name in enumerate(self.axes, start=1)]
         path = self.folder / _CONFIG
         text = "# Written by `autospine demo`.\n" + _toml(tables)
@@ -210,6 +222,9 @@ class DemoRoom:
         text += "".join(f"\n[[service.token]]\n{_toml_keys(t)}" for t in self._token_tables())
         path.write_text(text, encoding="utf-8")
         return path
+
+    def _adapt(self, tables: dict[str, dict[str, Any]]) -> None:
+        """Change the room's tables before they are written; as they are here."""
 
     def _token_tables(self) -> list[dict[str, str]]:
         """Who may use the service; the scanner finds its own token in its file."""
