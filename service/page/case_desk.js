@@ -3,7 +3,7 @@
 import { order } from "./api.js";
 import { act } from "./actions.js";
 import { byId, h, replace, setHidden, whenChanged } from "./dom.js";
-import { clock, plain } from "./format.js";
+import { clock } from "./format.js";
 
 // What ends a case is not under the pointer at once: a click that was meant for another button.
 const READ_FIRST_MS = 700;
@@ -66,7 +66,7 @@ export const drawHolding = whenChanged(({ holding, folder, role, busy }) => {
   const rows = holding.map((held) => h("tr", {},
     h("td", { class: "left" }, `${held.slices} ${held.slices === 1 ? "slice" : "slices"}`, held.description ? `, ${held.description}` : ""),
     h("td", { class: "left" }, clock(held.first_received_s), held.slices > 1 ? ` to ${clock(held.last_received_s)}` : ""),
-    h("td", { class: "left" }, held.reason || plain(held.code)),
+    h("td", { class: "left" }, held.reason),
     h("td", {}, folder && held.may_be_taken && role === "operator" ? take(held) : null)));
   const head = ["What", "Received", "Why", ""].map((name) => h("th", { scope: "col" }, name));
   replace(byId("holding"), h("table", {}, h("thead", {}, h("tr", {}, head)), h("tbody", {}, rows)));

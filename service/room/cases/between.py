@@ -43,6 +43,9 @@ class BetweenCases:
     def keep_ready(self) -> None:
         """Nothing is ready."""
 
+    def look_for_plans(self) -> None:
+        """Nothing is proposed without a case."""
+
     def describe(
         self,
         before: RoomState,
