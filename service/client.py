@@ -196,9 +196,13 @@ class RoomClient:
         body = {"by": self._by, "emergency": emergency}
         self._ask("POST", "/api/v1/stop", json=body, timeout=_STOP_TIMEOUT_S)
 
-    def reset(self) -> None:
-        """Clear a latched stop, take the positions as they stand or are recorded, and arm."""
-        self._order("POST", "/api/v1/reset")
+    def reset(self, positions_um: Mapping[str, int] | None = None) -> None:
+        """Clear a latched stop, and arm.
+
+        positions_um: where axes stand whose position is not certain; robot.taken_um of the state,
+        or better.
+        """
+        self._order("POST", "/api/v1/reset", positions_um=dict(positions_um or {}) or None)
 
     def start_calibration(self, *, guide: bool | None = None) -> int:
         """guide: with both fiducials and four axes; None: as the room is configured."""

@@ -26,7 +26,9 @@ export function actionsFor(state) {
     add(words.needleOut, post("needle-out"), robot.linked && robot.insertion_locked);
     return list;
   }
-  add(robot.stopped ? words.rearm : words.arm, post("reset"),
+  const stands = Object.keys(robot.taken_um ?? {}).length > 0;
+  const arm = robot.stopped ? words.rearm : words.arm;
+  add(stands ? words.standThere(arm) : arm, post("reset", stands ? { positions_um: robot.taken_um } : {}),
     robot.linked && !robot.moving && (robot.stopped || !robot.armed || !robot.position_certain));
   if (state.ready) {
     add(words.puncture, "puncture", robot.insertion_locked && !state.punctured);

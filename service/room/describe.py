@@ -47,6 +47,7 @@ from service.room.state import (
     RoomState,
     SliceState,
 )
+from service.room.whereabouts import source_of, taken_to_stand
 
 PROCESSES = ("listener", "worker")
 _BEAT_IS_OLD_S = 1.0
@@ -184,6 +185,7 @@ def describe_robot(link: RoomLink, before: RobotState) -> RobotState:
     status = link.status
     if status is None:
         return before.model_copy(update={"linked": False, "problem": link.problem})
+    taken = taken_to_stand(status)
     return RobotState(
         linked=True,
         problem="",
@@ -198,6 +200,8 @@ def describe_robot(link: RoomLink, before: RobotState) -> RobotState:
         travel_um=link.travel_um,
         fault=status.fault,
         boot_id=status.boot_id,
+        taken_um={axis: one.at_um for axis, one in taken.items()},
+        taken_from=source_of(taken) if taken else "",
     )
 
 

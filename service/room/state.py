@@ -18,7 +18,11 @@ class _Frozen(BaseModel):
 
 
 class RobotState(_Frozen):
-    """The bridge as it last said it was; `linked` False: what follows is old."""
+    """The bridge as it last said it was; `linked` False: what follows is old.
+
+    taken_um: where axes that are not certain are taken to stand, `taken_from` what; to be confirmed
+    by whoever arms.
+    """
 
     linked: bool = False
     problem: str = "not connected yet"
@@ -33,6 +37,8 @@ class RobotState(_Frozen):
     travel_um: dict[str, tuple[int, int]] = {}
     fault: str | None = None
     boot_id: str = ""
+    taken_um: dict[str, int] = {}
+    taken_from: str = ""
 
 
 class AcquisitionState(_Frozen):

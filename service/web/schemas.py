@@ -19,6 +19,16 @@ class Ask(_Body):
     by: str = Field(default="operator", min_length=1, max_length=64, description=_WHO)
 
 
+class ResetBody(Ask):
+    positions_um: dict[str, int] | None = Field(
+        default=None,
+        max_length=32,
+        description="Where the axes stand whose position is not certain, as somebody has seen: "
+        "what the state shows as robot.taken_um, or better.",
+        examples=[{"xt": 5000, "yt": -3000}],
+    )
+
+
 class PointBody(Ask):
     """A point in the patient, LPS mm."""
 

@@ -47,7 +47,7 @@ RECORDED = {
     ),
 }
 OTHERS = {
-    CALIBRATION: CALIBRATED | {"shifts_px", "method"},
+    CALIBRATION: CALIBRATED | {"shifts_px", "method", "last", "same_mount"},
     APPROACH: APPROACHED | {"confirm_moves", "strategy", "stop_rule", "seed"},
     GUIDE_CALIBRATION: CALIBRATED | {"geometry"},
     GUIDE_APPROACH: APPROACHED | {"confirm_moves", "geometry", "lower_plane_mm"},

@@ -28,7 +28,7 @@ class Commands:
         self._room = room
         self._case = CaseCommands(room, life)
         self._proposals = ProposalCommands(room, TargetCommands(room))
-        all_of_case = (*_all_of(room, self._proposals), *self._case.all())
+        all_of_case = (*_all_of(room, life, self._proposals), *self._case.all())
         self._by_name = {one.__name__: one for one in all_of_case}
 
     def carry_out(self, name: str, arguments: Mapping[str, Any]) -> Any:
@@ -45,9 +45,15 @@ class Commands:
         self._proposals.look_for_plans()
 
 
-def _all_of(room: Room, proposals: ProposalCommands) -> tuple[Callable[..., Any], ...]:
+def _all_of(
+    room: Room, life: CaseLife, proposals: ProposalCommands
+) -> tuple[Callable[..., Any], ...]:
     robot = RobotCommands(room)
-    target, procedure, record = TargetCommands(room), ProcedureCommands(room), RecordCommands(room)
+    target, procedure, record = (
+        TargetCommands(room),
+        ProcedureCommands(room, life.cases),
+        RecordCommands(room),
+    )
     return (
         robot.reset,
         robot.note_stop,
