@@ -32,6 +32,7 @@ from service.room.motion_allowed import may_start
 from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
 from service.room.prompt import is_calibrated, is_punctured, outcome_text, prompt
 from service.room.proposals import ProposalBook
+from service.room.robot.whereabouts import source_of, taken_to_stand
 from service.room.scanner_clock import clock_update
 from service.room.state import (
     AcquisitionState,
@@ -47,7 +48,6 @@ from service.room.state import (
     RoomState,
     SliceState,
 )
-from service.room.whereabouts import source_of, taken_to_stand
 
 PROCESSES = ("listener", "worker")
 _BEAT_IS_OLD_S = 1.0

@@ -13,7 +13,7 @@ from service.procedure.targets import current_entry, current_target
 from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.present import Readiness
-from service.room.whereabouts import in_words, taken_to_stand
+from service.room.robot.whereabouts import in_words, taken_to_stand
 
 
 def prompt(

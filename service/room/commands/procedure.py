@@ -29,10 +29,10 @@ from service.procedure.targets import (
     current_entry_number,
     current_target,
 )
-from service.room.cases.robot_memory import last_jacobian
 from service.room.context import Room
 from service.room.present import PUNCTURE, readiness
 from service.room.readiness import ConflictError
+from service.room.robot.memory import last_jacobian
 
 
 class ProcedureCommands:

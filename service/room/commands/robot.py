@@ -11,7 +11,7 @@ from service.procedure.start_point import POSITION_DECLARED
 from service.room.context import Room
 from service.room.present import NEEDLE_OUT
 from service.room.readiness import ConflictError
-from service.room.whereabouts import in_words, taken_to_stand
+from service.room.robot.whereabouts import in_words, taken_to_stand
 
 
 class RobotCommands:
