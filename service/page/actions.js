@@ -142,6 +142,8 @@ function moreOf(state) {
   const wanted = state.acquisition_request;
   const place = state.belief?.hold;
   if (wanted) return words.hold(wanted.hold_id, place?.place ?? 1, place?.of ?? 1, wanted.count);
+  const taken = Object.entries(state.robot.taken_um ?? {}).map(([axis, um]) => `${axis} ${mm(um / 1000, 3)} mm`);
+  if (taken.length) return words.taken(taken.join(", "), state.robot.taken_from);
   if (state.procedure) return words.running(TEXTS.procedures[state.procedure] ?? state.procedure.replaceAll("_", " "));
   return state.last_outcome ? words.last(state.last_outcome.replace(/^\w+/, (name) => TEXTS.procedures[name] ?? name)) : "";
 }

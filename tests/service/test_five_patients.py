@@ -85,7 +85,7 @@ def arm(page: Page, client: RoomClient) -> None:
     state = until(client, lambda s: s.robot.linked and not s.robot.moving)
     if state.robot.stopped or not state.robot.armed or not state.robot.position_certain:
         if state.robot.taken_um:
-            expect(page.locator("#prompt")).to_contain_text("are taken to stand at")
+            expect(page.locator("#next")).to_contain_text("are taken to stand at")
         press(page, re.compile("(arm|Arm) the robot$"))
     until(client, lambda s: s.robot.armed and not s.robot.stopped)
 
