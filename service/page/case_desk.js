@@ -29,15 +29,13 @@ function finishCase() {
   const box = h("div", { class: "finish-case" });
   const closed = () => replace(box, h("button", { type: "button", class: "plain", onclick: opened }, "Finish the case …"));
   const opened = () => {
-    const park = h("input", { type: "checkbox", id: "finish-park" });
     const finish = h("button", {
       type: "button", disabled: true,
-      onclick: () => act(() => order("POST", "api/v1/case/finish", { park: park.checked })),
+      onclick: () => act(() => order("POST", "api/v1/case/finish")),
     }, "Finish the case now");
     setTimeout(() => { finish.disabled = false; }, READ_FIRST_MS);
     replace(box,
       h("p", {}, "The robot is disarmed, and nothing of this case changes any more. Report and export are written into its folder."),
-      h("p", {}, park, " ", h("label", { htmlFor: "finish-park" }, "Take the power off the drives, too")),
       h("p", {}, h("button", { type: "button", onclick: closed }, "Not yet"), " ", finish));
   };
   closed();

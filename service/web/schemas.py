@@ -119,10 +119,6 @@ class CaseBegun(BaseModel):
     folder: str
 
 
-class FinishBody(Ask):
-    park: bool = Field(default=False, description="True: take the power off the drives, too.")
-
-
 class StudyBody(Ask):
     study: str = Field(
         min_length=1,

@@ -43,8 +43,8 @@ class CaseCommands:
         """Only where none is open."""
         return self.begin_case(by)
 
-    def finish_case(self, by: str, park: bool = False) -> str:
-        """Nothing moves in this case any more: disarm (and park), and close it.
+    def finish_case(self, by: str) -> str:
+        """Nothing moves in this case any more: disarm, and close it.
 
         Return the name of its folder. The needle must be out, and no procedure may run.
         """
@@ -58,14 +58,14 @@ class CaseCommands:
             raise ConflictError(
                 "needle_in", "The needle may be in: say first that it is out, then finish the case."
             )
-        self._disarm(by, park)
+        self._disarm(by)
         with room.record.transaction():
             room.record.end_open_hold(time.time())
-            room.note(FINISHED, by, {"parked": park, "linked": status is not None})
+            room.note(FINISHED, by, {"linked": status is not None})
         cases.set_open(None)
         return room.record.case_dir.name
 
-    def _disarm(self, by: str, park: bool) -> None:
+    def _disarm(self, by: str) -> None:
         """Without a link there is nothing to disarm: the bridge has stopped by itself."""
         client, status = self._room.link.client, self._room.link.status
         if status is None:
