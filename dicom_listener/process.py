@@ -3,7 +3,7 @@
 import sqlite3
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +22,7 @@ from dicom_listener.holding_area import INBOX
 from dicom_listener.inbox import Inbox
 from dicom_listener.intake import IntakeRules
 from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.network.drop_folder import DropFolder
 from dicom_listener.reception import Reception
 from dicom_listener.retention import remove_old
 from dicom_listener.scp import Scp, ScpRules, tls_context
@@ -174,6 +175,18 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             metrics_port, stop_metrics = metrics.serve(config.listener.metrics_port)
             stack.callback(stop_metrics)
         scp.start()
+        ways_in: list[Scp | DropFolder] = [scp]
+        if config.listener.watch_dir is not None:
+            drop_folder = DropFolder(
+                config.listener.watch_dir,
+                cases.home / "watch_dir.taken",
+                inbox,
+                received.put,
+                max_object_bytes=config.listener.max_object_mib * _MIB,
+            )
+            stack.callback(drop_folder.stop)
+            drop_folder.start()
+            ways_in.append(drop_folder)
         on_ready(Ready(scp.port, metrics_port, config.listener.ae_title))
         # Receiving needs no memory of the case: a long record must not keep a scanner waiting.
         reception = Reception(cases, inbox, rules, metrics)
@@ -187,12 +200,13 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         retention_s = config.listener.retention_days * 86400
         tending = Tending(inbox, reception, retention_s)
         attempts = stack.enter_context(Attempts(cases.home, "listener"))
-        _loop(reception, scp, tending, received, stop, presence, attempts)
+        _loop(reception, scp, ways_in, tending, received, stop, presence, attempts)
 
 
 def _loop(
     reception: Reception,
     scp: Scp,
+    ways_in: Sequence[Scp | DropFolder],
     tending: "Tending",
     received: "SimpleQueue[Path]",
     stop: threading.Event,
@@ -208,8 +222,9 @@ def _loop(
                 _requeue(reception, received)
             _take_received(reception, received, attempts)
             reception.turn()
-            while scp.alarms:
-                reception.note_alarm(*scp.alarms.popleft())
+            for way_in in ways_in:
+                while way_in.alarms:
+                    reception.note_alarm(*way_in.alarms.popleft())
             tending.turn()
         except (CaseRecordError, sqlite3.Error, OSError) as error:
             # The slices are safe in the inbox: tried again until the record can be written.

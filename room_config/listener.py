@@ -47,6 +47,11 @@ class ListenerConfig(Section):
     tls_authority: Path | None = Field(
         default=None, description="PEM file of the authority that signs the senders' certificates."
     )
+    watch_dir: Path | None = Field(
+        default=None,
+        description="A folder (share) to which the scanner's console writes slices: a second way "
+        "in. It is only read.",
+    )
     scanner_time_zone: str = Field(
         default="",
         description="IANA name of the zone of scanners that do not say; empty: this computer's.",
