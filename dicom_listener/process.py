@@ -22,6 +22,7 @@ from dicom_listener.holding_area import INBOX
 from dicom_listener.inbox import Inbox
 from dicom_listener.intake import IntakeRules
 from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.network.commitment import Commitment, KeptInstances
 from dicom_listener.network.drop_folder import DropFolder
 from dicom_listener.reception import Reception
 from dicom_listener.retention import remove_old
@@ -133,6 +134,7 @@ def open_scp(
     inbox: Inbox,
     metrics: ListenerMetrics,
     on_stored: Callable[[Path], None],
+    commitment: Commitment | None = None,
 ) -> Scp:
     """The service, bound to its port. Raises ConfigError where port, list or key is no good."""
     tls = None
@@ -142,12 +144,27 @@ def open_scp(
         except OSError as error:
             raise ConfigError(f"listener.tls_*: certificates cannot be used ({error})") from None
     try:
-        return Scp(scp_rules(config), inbox, metrics, on_stored, tls)
+        return Scp(scp_rules(config), inbox, metrics, on_stored, tls, commitment)
     except ValueError as error:
         raise ConfigError(f"listener: {error}") from None
     except OSError as error:
         where = f"{config.host}:{config.port}"
         raise PortError(f"listener.port: cannot listen on {where} ({error.strerror})") from None
+
+
+def _commitment(config: ListenerConfig, cases: Cases) -> Commitment | None:
+    """None where files are removed after a while: what is not kept is not promised."""
+    if config.retention_days:
+        return None
+
+    def folders() -> list[Path]:
+        return [inbox_folder(home) for home in {cases.home, *cases.folders()}]
+
+    places = {
+        title: (place.rpartition(":")[0], int(place.rpartition(":")[2]))
+        for title, place in config.commitment_reports_to.items()
+    }
+    return Commitment(KeptInstances(folders), config.ae_title, places)
 
 
 def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]) -> None:
@@ -164,7 +181,8 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             min_free_bytes=config.listener.min_free_mib * _MIB,
         )
         rules = intake_rules(config)
-        scp = open_scp(config.listener, inbox, metrics, received.put)
+        commitment = _commitment(config.listener, cases)
+        scp = open_scp(config.listener, inbox, metrics, received.put, commitment)
         stack.callback(scp.stop)
         discarded = inbox.discard_unfinished()
         metrics.show("associations_open", "Open associations", lambda: scp.open_associations)
