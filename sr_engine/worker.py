@@ -123,6 +123,9 @@ def serve(config: Config, should_stop: Callable[[], bool]) -> None:
             except (CaseRecordError, sqlite3.Error, OSError) as error:
                 log.error("the case record cannot be used", error=str(error))
                 time.sleep(_RECORD_RETRY_S)
+            except Exception:  # the requests stand in the record: nothing is lost by trying again
+                log.exception("the worker's loop")
+                time.sleep(_RECORD_RETRY_S)
 
 
 def _work_on(
