@@ -339,6 +339,8 @@ class ControlLoop:
         self._answer_queue()
         if self._publish_if_due():
             self._keep_ready()
+            if self._commands is not None:
+                self._commands.look_for_plans()
         # last: what the waiting step looks at next is fresh, and screens do not delay a decision
         self._link.pump(_TICK_S)
 
