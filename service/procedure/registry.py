@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, fields, replace
 from typing import Any
 
-from case_record.record import CaseRecord
+from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Procedure
 from service.procedure.approach import ApproachArguments, Arrival, approach
 from service.procedure.calibration import Calibration, CalibrationArguments, calibrate
@@ -16,6 +16,7 @@ from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_recording import GuidePlace, GuideRecordingArguments, record_guide
 from service.procedure.jog import JogEnd, jog
 from service.procedure.recording import Place, RecordingArguments, record_place
+from service.procedure.scan_frame import frame_of, other_place_since
 from service.procedure.sensing import ValidationGate
 from service.procedure.steps import ProcedureSteps
 
@@ -90,7 +91,8 @@ def result_to_json(
 
 
 def latest_calibration(record: CaseRecord, *, guide: bool = False) -> Calibration | None:
-    """What the last procedure that came to its end knew; a later calibration replaces it.
+    """What the last procedure that came to its end knew; a later calibration replaces it. None
+    without one, and once slices of another frame of reference have come.
 
     guide: of both fiducials and four axes, else of one and two.
     """
@@ -103,7 +105,21 @@ def latest_calibration(record: CaseRecord, *, guide: bool = False) -> Calibratio
         if row is not None and row.result is not None and row.procedure_id > newest.procedure_id:
             newest = row
     known = newest.result or {}
-    return Calibration.from_json(known.get("calibration", known))
+    found = Calibration.from_json(known.get("calibration", known))
+    return None if _is_of_another_place(record, found) else found
+
+
+def _is_of_another_place(record: CaseRecord, calibration: Calibration) -> bool:
+    """True if its frame of reference is not that of now: plane and estimate mean nothing there."""
+    try:
+        measurement = record.measurement(calibration.measurement_id)
+        frame = frame_of(record, measurement)
+    except CaseRecordError:
+        return False
+    if frame is None:
+        return False
+    here = replace(frame, study="")  # another study on the same table: the frame tells
+    return bool(other_place_since(record, measurement.requested_seq, here))
 
 
 def _build_calibration(value: Mapping[str, Any]) -> ProcedureSteps[Calibration]:

@@ -95,7 +95,10 @@ class Room:
         """The calibration with the estimate carried to where the robot stands now."""
         calibration = latest_calibration(self.record, guide=guide)
         if calibration is None:
-            raise ConflictError("not_calibrated", "Calibrate first.")
+            raise ConflictError(
+                "not_calibrated",
+                "Calibrate first (a new frame of reference voids the calibration before).",
+            )
         status = self.linked()
         noise = gate_of(self.config).noise
         return start_point(self.record, calibration, status.positions_um, noise)

@@ -25,6 +25,7 @@ from service.procedure.guide_recording import GuidePlace
 from service.procedure.recording import Place
 from service.procedure.registry import build_procedure, result_to_json
 from service.procedure.runner import ReplayMismatchError, run_procedure
+from service.procedure.scan_frame import frame_of
 from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steps import Outcome, Step
 from service.procedure.targets import ENTRY_SET, TARGET_SET
@@ -305,6 +306,9 @@ class ControlLoop:
             "procedure_id": recorded.procedure_id,
             "sigma_mm": place.to_json()["sigma_mm"],
         }
+        frame = frame_of(self._record, self._record.measurement(place.calibration.measurement_id))
+        if frame is not None:
+            body["scan_frame"] = frame.to_json()
         self._record.append_event(TARGET_SET, body, source="service", who=who)
 
     def _tick(self) -> None:

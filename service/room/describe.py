@@ -11,7 +11,13 @@ from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, SliceRow
 from room_config.load import Config
-from service.procedure.targets import current_entry, current_target
+from service.procedure.targets import (
+    Target,
+    TargetError,
+    current_entry,
+    current_target,
+    why_void_target,
+)
 from service.room.alarms import AlarmBook, Condition
 from service.room.conditions import HANGS, conditions
 from service.room.context import now_of
@@ -74,7 +80,8 @@ class Describer:
         config, record, link = self._config, self._record, self._link
         case = record.case()
         target = current_target(record)
-        target_mm = list(target.patient_mm) if target else None
+        void = why_void_target(record, target) if target else ""
+        target_mm = list(target.patient_mm) if target and not void else None
         measurement = record.last_measurement()
         now = now_of(config, link)
         found = readiness(record, now)
@@ -100,7 +107,8 @@ class Describer:
                 "calibrated": is_calibrated(config, record),
                 "target_patient_mm": tuple(target_mm) if target_mm else None,
                 "entry_patient_mm": current_entry(record),
-                **_error(config, record, target_mm, now),
+                "target_lost": LostState(code="target_void", text=void) if void else None,
+                **_error(config, record, None if void else target, void, now),
                 "event_id": record.last_event_id(),
                 "processes": self._look_at_processes(),
                 "proposals": self._proposals.update(record),
@@ -248,18 +256,21 @@ def _measurement(record: CaseRecord, last: Measurement | None, now: Now) -> Meas
 
 
 def _error(
-    config: Config, record: CaseRecord, target_mm: list[float] | None, now: Now
+    config: Config, record: CaseRecord, target: Target | None, void: str, now: Now
 ) -> dict[str, Any]:
     """How far off it is now; if that is not known, why not."""
     last = record.last_measurement("done")
     if last is None:
         return {"error": None, "error_reason": "nothing was measured yet"}
-    if target_mm is None:
-        return {"error": None, "error_reason": "no target is set"}
     lost = why_not_now(record, last, now)
     if lost is not None:
         return {"error": None, "error_reason": lost.text}
-    error = describe_error(config, record, target_mm)
+    if target is None:
+        return {"error": None, "error_reason": void or "no target is set"}
+    try:
+        error = describe_error(config, record, target)
+    except TargetError as unusable:
+        return {"error": None, "error_reason": str(unusable)}
     return {"error": error, "error_reason": "" if error else "not calibrated"}
 
 

@@ -22,11 +22,12 @@ from service.room.summaries import CaseSummary, KnownTarget, MeasurementBody
 class Targets:
     """Since when which target (patient mm) was set, oldest first; None: it was withdrawn."""
 
-    since_s: tuple[float, ...]
+    since_seq: tuple[int, ...]
     patient_mm: tuple[tuple[float, float, float] | None, ...]
 
-    def at(self, instant_s: float) -> tuple[float, float, float] | None:
-        place = bisect_right(self.since_s, instant_s)
+    def at(self, seq: int) -> tuple[float, float, float] | None:
+        """The target that was set at this place in the order of the record."""
+        place = bisect_right(self.since_seq, seq)
         return self.patient_mm[place - 1] if place else None
 
     def body_of(self, row: Measurement) -> MeasurementBody:
@@ -52,7 +53,7 @@ class Targets:
     def _error_mm(self, row: Measurement) -> float | None:
         if row.request.get("slice_position_mm") is not None:
             return None  # one of two fiducials: the target is the needle's, not this one's
-        target = self.at(row.requested_s)
+        target = self.at(row.requested_seq)
         if target is None or not row.result:
             return None
         plane = ImagePlane.from_json(row.result["plane"])
@@ -87,7 +88,7 @@ def targets_over_time(record: CaseRecord) -> Targets:
     events = [*record.events_of_kind(TARGET_SET), *record.events_of_kind(TARGET_WITHDRAWN)]
     events.sort(key=lambda event: event.event_id)
     return Targets(
-        tuple(event.wall_s for event in events),
+        tuple(event.seq for event in events),
         tuple(target_of(e).patient_mm if e.kind == TARGET_SET else None for e in events),
     )
 

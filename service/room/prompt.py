@@ -8,8 +8,8 @@ from case_record.record import CaseRecord
 from robot_bridge.client.client import BridgeStatus
 from robot_bridge.protocol.phases import WorkPhase
 from room_config.load import Config
-from service.procedure.registry import CALIBRATION, GUIDE_CALIBRATION
-from service.procedure.targets import current_entry, current_target
+from service.procedure.registry import latest_calibration
+from service.procedure.targets import current_entry, current_target, why_void_target
 from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.present import Readiness
@@ -43,8 +43,11 @@ def _idle_prompt(
         return "Arm the robot."
     if not is_calibrated(config, record):
         return "Start the calibration."
-    if current_target(record) is None:
+    target = current_target(record)
+    if target is None:
         return "Set a target."
+    if why := why_void_target(record, target):
+        return f"Set the target anew: {why}."
     if config.service.guide is not None and current_entry(record) is None:
         return "Set an entry point."
     return "Start the approach, or set another target."
@@ -60,8 +63,7 @@ def _after_arrival(found: Readiness, status: BridgeStatus) -> str:
 
 def is_calibrated(config: Config, record: CaseRecord) -> bool:
     """As the room is used: with the guide's four axes if it has them."""
-    name = CALIBRATION if config.service.guide is None else GUIDE_CALIBRATION
-    return record.last_procedure(name, "done") is not None
+    return latest_calibration(record, guide=config.service.guide is not None) is not None
 
 
 def plain_words(code: str) -> str:

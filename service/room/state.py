@@ -222,6 +222,7 @@ class RoomState(_Frozen):
     calibrated: bool = False
     guide: bool = False
     target_patient_mm: tuple[float, float, float] | None = None
+    target_lost: LostState | None = None
     error: ErrorState | None = None
     error_reason: str = ""
     tolerance_mm: float

@@ -215,7 +215,9 @@ class LineRoom:
         for asked in self.loop._record.requested_measurements():
             self._measure(asked)
 
-    def _add_slice(self, hold_id: int | None, header: dict[str, Any]) -> int:
+    def _add_slice(
+        self, hold_id: int | None, header: dict[str, Any], reason_code: str = "outside_hold"
+    ) -> int:
         self._slices += 1
         geometry = {
             "shape": [128, 128],
@@ -232,7 +234,7 @@ class LineRoom:
                 path="none",
                 state="quarantined" if hold_id is None else "assigned",
                 hold_id=hold_id,
-                reason_code="" if hold_id else "outside_hold",
+                reason_code="" if hold_id else reason_code,
                 reason="",
                 received_s=time.time(),
                 received_monotonic_s=time.monotonic(),

@@ -19,6 +19,7 @@ from service.procedure.registry import (
     guide_approach_arguments,
     guide_calibration_arguments,
 )
+from service.procedure.scan_frame import newest_frame
 from service.procedure.steering import CONFIRM
 from service.procedure.targets import (
     Target,
@@ -26,6 +27,7 @@ from service.procedure.targets import (
     current_entry,
     current_entry_number,
     current_target,
+    why_void_target,
 )
 from service.room.context import Room
 from service.room.present import PUNCTURE, readiness
@@ -80,6 +82,7 @@ class ProcedureCommands:
         except TargetError as error:
             raise _unusable(error) from error
         body = {**approach_arguments(arguments, start), "target": target.number}
+        body["scan_frame"] = self._scan_frame()
         return self._room.begin(APPROACH, body, by)
 
     def _start_guide_approach(self, guide: GuideConfig, by: str) -> int:
@@ -101,18 +104,24 @@ class ProcedureCommands:
             raise _unusable(error) from error
         entry = current_entry_number(self._room.record)
         body = {**guide_approach_arguments(arguments, start), "target": target.number}
-        body["entry"] = entry
+        body["entry"], body["scan_frame"] = entry, self._scan_frame()
         return self._room.begin(GUIDE_APPROACH, body, by)
 
     def _target(self) -> Target:
         target = current_target(self._room.record)
         if target is None:
             raise ConflictError("no_target", "Set a target first.")
+        if why := why_void_target(self._room.record, target):
+            raise ConflictError("target_void", f"The target cannot be used: {why}.")
         return target
 
     def _newest_header(self) -> Mapping[str, Any]:
         newest = self._room.record.last_slice("assigned")
         return {} if newest is None else newest.header
+
+    def _scan_frame(self) -> dict[str, Any] | None:
+        frame = newest_frame(self._room.record)
+        return None if frame is None else frame.to_json()
 
     def answer(self, question_id: str, choice: str, by: str, plan_id: str | None = None) -> None:
         """Answer the question that is on the page; void if it is another one by now.
