@@ -8,7 +8,7 @@ beside it by the oil-water shift of the slices, which follows from their header.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -44,7 +44,7 @@ class Target:
     label: str = ""
     in_water: bool = False
     frame: ScanFrame | None = None
-    frame_seq: int = 0
+    frame_seq: int = field(default=0, compare=False)
 
 
 def current_target(record: CaseRecord) -> Target | None:

@@ -13,9 +13,10 @@ from room_config.load import Config
 from room_config.service import GuideConfig
 from service.procedure.calibration import Calibration
 from service.procedure.fiducial_plan import gate_of
+from service.procedure.identity import ProofArguments
 from service.procedure.plan import Travel
 from service.procedure.registry import latest_calibration
-from service.procedure.start_point import start_point
+from service.procedure.start_point import is_proven, start_point
 from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
@@ -102,3 +103,11 @@ class Room:
         status = self.linked()
         noise = gate_of(self.config).noise
         return start_point(self.record, calibration, status.positions_um, noise)
+
+    def is_proven(self, start: Calibration) -> bool:
+        """Whether what a start point says was seen to move with the robot, and not lost since."""
+        return is_proven(self.record, start, self.linked().positions_um)
+
+    def proof_arguments(self, start: Calibration) -> ProofArguments:
+        confirm, travel_um = self.config.service.confirm_moves, self.link.travel_um
+        return ProofArguments(self.is_proven(start), dict(travel_um), confirm)

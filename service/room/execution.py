@@ -16,8 +16,7 @@ from room_config.load import Config
 from service.procedure.plan import PLAN_VOID, why_void
 from service.procedure.runner import measurement_name
 from service.procedure.scan_frame import ScanFrame, frame_of
-from service.procedure.sensing import ABORT, ProcedureFailedError
-from service.procedure.steering import CONFIRM
+from service.procedure.sensing import ABORT, CONFIRM, ProcedureFailedError
 from service.procedure.steps import (
     Acquire,
     Acquired,

@@ -64,7 +64,10 @@ class LineRoom:
     """`call` orders, `do` what happens to the room, `until` the state is as wanted."""
 
     def __init__(self, folder: Path, more: str = "", seed: int = 1) -> None:
-        (folder / "room.toml").write_text(_FILE.format(more=more))
+        text = _FILE.format(more=more)
+        if "confirm_moves = true" in more:
+            text = text.replace("confirm_moves = false\n", "")
+        (folder / "room.toml").write_text(text)
         (folder / "bridge").mkdir()
         self.config = load_config(folder / "room.toml", {})
         self.line = VirtualRoom(folder / "bridge", seed)

@@ -20,7 +20,7 @@ from service.procedure.registry import (
     guide_calibration_arguments,
 )
 from service.procedure.scan_frame import newest_frame
-from service.procedure.steering import CONFIRM
+from service.procedure.sensing import CONFIRM
 from service.procedure.targets import (
     Target,
     TargetError,
@@ -78,6 +78,7 @@ class ProcedureCommands:
                 target,
                 self._newest_header(),
                 self._room.seed(),
+                proven=self._room.is_proven(start),
             )
         except TargetError as error:
             raise _unusable(error) from error
@@ -99,6 +100,7 @@ class ProcedureCommands:
                 entry_mm,
                 target,
                 self._newest_header(),
+                proven=self._room.is_proven(start),
             )
         except TargetError as error:
             raise _unusable(error) from error

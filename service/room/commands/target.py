@@ -89,10 +89,12 @@ class TargetCommands:
         guide = self._room.guide_wanted(None)
         if guide is not None:
             start = self._room.start_point(guide=True)
-            told = recording_arguments(guide_recording_of(self._room.config, guide), start)
+            proof = self._room.proof_arguments(start)
+            told = recording_arguments(guide_recording_of(self._room.config, guide, proof), start)
             return self._room.begin(GUIDE_RECORDING, {**told, "label": label, "by": by}, by)
-        arguments = recording_of(self._room.config, self._room.seed())
         start = self._room.start_point()
+        proof = self._room.proof_arguments(start)
+        arguments = recording_of(self._room.config, self._room.seed(), proof)
         body = {**recording_arguments(arguments, start), "label": label, "by": by}
         return self._room.begin(RECORDING, body, by)
 
