@@ -3,7 +3,8 @@
 A slice is assigned to a hold only if all of this holds; one missing proof sets it aside.
 
 1. Time. Its acquisition, by the scanner's clock and the worst case of the offset between the
-   clocks, began after the hold had settled, and had ended before the hold did.
+   clocks, began after the hold had settled, and had ended before the hold did. Where the offset is
+   not known it waits.
 2. Receipt. It was received before the hold ended. An acquisition ends before it is received, by
    our own clock: so its end is proved whatever the scanner's clock says, and a clock that was set
    back can never carry a slice into an earlier hold.
@@ -24,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dicom_listener.belonging import Binding, why_not_of
-from dicom_listener.clock import OffsetBounds
+from dicom_listener.clock import Offset, OffsetUnknown
 from dicom_slice.geometry import SliceGeometry
 from dicom_slice.header import Slice
 from dicom_slice.reasons import Reason
@@ -105,7 +106,7 @@ def assign(
     received_s: float,
     holds: Sequence[HoldWindow],
     known: Sequence[Known],
-    offset: OffsetBounds | None,
+    offset: Offset,
     rules: AssignRules,
     binding: Binding | None = None,
 ) -> Decision:
@@ -150,7 +151,7 @@ def _by_time(
     slice_: Slice,
     received_s: float,
     holds: Sequence[HoldWindow],
-    offset: OffsetBounds | None,
+    offset: Offset,
     rules: AssignRules,
 ) -> Placed:
     interval = slice_.interval
@@ -158,10 +159,10 @@ def _by_time(
         if slice_.time_problem:
             return Quarantined(Reason.IMPLAUSIBLE_TIME, slice_.time_problem)
         return Quarantined(Reason.NO_TIME, "the header has no acquisition time")
-    if offset is None:
-        return Quarantined(
-            Reason.CLOCK_UNKNOWN, "the scanner's clock is not known: sync it or scan again"
-        )
+    if isinstance(offset, OffsetUnknown):
+        if any(hold.was_open_at(received_s) for hold in holds):
+            return Pending(Reason.CLOCK_UNKNOWN, offset.text)
+        return Quarantined(Reason.NO_HOLD, "no hold was open when it was received")
     earliest_s, latest_start_s = interval.start_s + offset.low_s, interval.start_s + offset.high_s
     if not earliest_s <= received_s:
         ahead_s = earliest_s - received_s
@@ -222,7 +223,7 @@ def _by_arrival(
     slice_: Slice,
     received_s: float,
     holds: Sequence[HoldWindow],
-    offset: OffsetBounds | None,
+    offset: Offset,
     rules: AssignRules,
 ) -> Placed:
     hold = next((hold for hold in holds if hold.was_open_at(received_s)), None)

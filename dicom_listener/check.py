@@ -24,7 +24,7 @@ Result = tuple[str, bool, str]
 
 def self_check(config: Config) -> list[Result]:
     """Return (what, passed, in words). Raises ConfigError where the configuration is no good."""
-    intake_rules(config, time.time())
+    intake_rules(config)
     folder = inbox_folder(Cases(*config.room.folders).home)
     return [_disk(config, folder), _write(folder), _clock(), _echo(config)]
 

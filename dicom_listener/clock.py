@@ -1,51 +1,88 @@
 """How far the scanner's clock is from ours: an interval that never pretends to know more.
 
 offset_s = our wall clock - the scanner's clock, at the same instant. A slice is received after its
-acquisition ended, so every one of them gives an upper bound: receipt - end. The promptest of them
-came within `prompt_delay_s` of its end, which gives the lower bound. An explicit sync bounds the
-offset before the first slice comes, and replaces what was known when a clock was set.
+acquisition ended, so each one bounds the offset from above: receipt - end. From below nothing in a
+slice bounds it, for nobody knows how late it is; and an offset believed too large makes an
+acquisition seem later than it was, which is how a slice is taken for a hold that came after it. So
+the lower bound comes from what people did at this site:
 
-The smallest lag is kept for as long as the case lasts and never rises by itself: an offset believed
-too small makes acquisitions look earlier than they were, and those are refused, not misplaced.
+- a comparison of the clocks, made at a known instant, which widens and ends with age;
+- promptness that was measured here: no slice comes later than so long after its end.
+
+Where both are known, an acquisition must be good by both: one may be wrong without harm. With
+neither there are no bounds at all. What contradicts them stops assignment by time until somebody
+compares the clocks again; it never replaces them.
 """
 
 from dataclasses import dataclass, replace
 
 from dicom_slice.times import AcquisitionInterval
 
-_DRIFT_SLICES = 10
+_LAGS_KEPT = 10
+_MUCH_SOONER_S = 0.5
+_MANY_TIMES = 10
+_LAGS_THAT_SHOW_A_HABIT = 5
+
+
+@dataclass(frozen=True)
+class Promptness:
+    """How soon slices come after their acquisition has ended, as measured at this site."""
+
+    least_s: float
+    most_s: float
 
 
 @dataclass(frozen=True)
 class ClockRules:
-    """What is taken for granted about a scanner and its network.
+    """What is known of a scanner, its network and of clocks.
 
-    prompt_delay_s: the promptest slice of a session is here that soon after its acquisition.
+    promptness: measured at this site; None: not measured, and nothing is believed of it.
+    witnesses: slices that must agree before promptness alone is believed: slices that were held up
+    do not come equally late.
     longest_acquisition_s: no acquisition that comes without its duration lasts longer.
-    largest_offset_s: without a sync, a clock further off than this is not believed to be a clock:
-    it is an old slice sent again.
     late_limit_s: a slice that seems to come later than this shows a clock that was set back, or a
     network that stood still, and nothing can tell which.
-    drift_ppm: widens a sync as it ages.
+    comparison_valid_s: a comparison says nothing of a slice further away in time than this, unless
+    the scanner says that its clock is synchronized (AcquisitionTimeSynchronized).
+    drift_ppm: what a clock may run off by while its time service slews it (ntpd: 500 ppm).
+    synchronized_drift_ppm: the same where the scanner says that it is synchronized.
     drift_alarm_s: how far the least lag of late may be from that of the beginning.
     """
 
-    prompt_delay_s: float = 3.0
+    promptness: Promptness | None = None
+    witnesses: int = 5
     longest_acquisition_s: float = 30.0
-    largest_offset_s: float = 600.0
     late_limit_s: float = 120.0
+    comparison_valid_s: float = 3600.0
     jump_tolerance_s: float = 0.5
-    drift_ppm: float = 50.0
+    drift_ppm: float = 500.0
+    synchronized_drift_ppm: float = 50.0
     drift_alarm_s: float = 1.0
+
+    @property
+    def on_the_way_s(self) -> float:
+        """A slice received so long after the clock was set may have been acquired before."""
+        if self.promptness is None:
+            return self.late_limit_s
+        return min(self.late_limit_s, _MANY_TIMES * self.promptness.most_s)
 
 
 @dataclass(frozen=True)
-class Sync:
-    """An explicit comparison of the two clocks, made at `at_s` (ours)."""
+class Comparison:
+    """The two clocks were compared at `at_s` (ours)."""
 
     offset_s: float
     uncertainty_s: float
     at_s: float
+
+    def bounds_at(self, instant_s: float, drift_ppm: float) -> "OffsetBounds":
+        half_s = self.uncertainty_s + abs(instant_s - self.at_s) * drift_ppm * 1e-6
+        return OffsetBounds(self.offset_s - half_s, self.offset_s + half_s)
+
+    def agrees_with(self, earlier: "Comparison", rules: ClockRules) -> bool:
+        then = earlier.bounds_at(self.at_s, rules.drift_ppm)
+        apart_s = abs(self.offset_s - earlier.offset_s)
+        return apart_s <= self.uncertainty_s + (then.high_s - then.low_s) / 2
 
 
 @dataclass(frozen=True)
@@ -55,136 +92,260 @@ class OffsetBounds:
     low_s: float
     high_s: float
 
-    @property
-    def middle_s(self) -> float:
-        return (self.low_s + self.high_s) / 2
+
+@dataclass(frozen=True)
+class OffsetUnknown:
+    """Nothing is known that would bound the offset; the text says what to do."""
+
+    text: str
+
+
+Offset = OffsetBounds | OffsetUnknown
+
+_WHAT_TO_DO = "compare the clocks, or confirm at which hold this acquisition was made"
+
+
+@dataclass(frozen=True)
+class Received:
+    """One slice, as its clock sees it."""
+
+    interval: AcquisitionInterval
+    received_s: float
+    synchronized: bool = False
 
     @property
-    def uncertainty_s(self) -> float:
-        return (self.high_s - self.low_s) / 2
+    def most_lag_s(self) -> float:
+        """Receipt less the earliest end: the offset cannot be larger."""
+        return self.received_s - earliest_end_s(self.interval)
+
+    def least_lag_s(self, rules: ClockRules) -> float:
+        """Receipt less the latest end: the offset plus the least delay."""
+        return self.received_s - latest_end_s(self.interval, rules)
 
 
 @dataclass(frozen=True)
 class ScannerClock:
     """What is known of one scanner's clock. Values only; `observe` makes the next one.
 
-    least_lag_s: least (receipt - end), with the start in place of an end that is not certain: the
-    offset cannot be larger. least_prompt_lag_s: least (receipt - certain end), and
-    least_loose_lag_s: the same over ends that are estimated or assumed: less the prompt delay, the
-    offset cannot be smaller.
+    comparisons: that agree with each other, oldest first.
+    set_at_s: until when the clock may have been set, by what somebody said or by comparisons that
+    do not agree; nothing from before counts. contradicted: what slices prove against what was
+    known; suspicion: what they make doubtful of it. Both stand until the next comparison.
+    least_lags (lag by the latest end, whether that is certain) and upper_s (the least lag by the
+    earliest end): over all slices since then. lags_s: of the last ones whose ends are certain.
     """
 
-    sync: Sync | None = None
-    least_lag_s: float | None = None
-    least_prompt_lag_s: float | None = None
-    least_loose_lag_s: float | None = None
+    comparisons: tuple[Comparison, ...] = ()
+    set_at_s: float | None = None
+    contradicted: str = ""
+    suspicion: str = ""
+    least_lags: tuple[tuple[float, bool], ...] = ()
+    upper_s: float | None = None
+    lags_s: tuple[float, ...] = ()
 
-    def bounds_for(
-        self, interval: AcquisitionInterval, received_s: float, rules: ClockRules
-    ) -> OffsetBounds | None:
-        """The interval in which the offset lies for this slice; None where evidence contradicts.
+    def compared(self, made: Comparison, rules: ClockRules) -> "ScannerClock":
+        """What is known once the clocks have been compared (again).
 
-        A sync does not raise the lower bound above what the lags alone give, and the slice's own
-        lag always counts: the clock may have gone forward since, by less than a slice takes to get
-        here, and nothing else would show it.
+        Where it does not agree with what was known, the clock was set at some time before.
         """
-        low_s, high_s = self._believed(received_s, rules)
-        lag_s = self.least_prompt_lag_s
-        if lag_s is None:
-            lag_s = self.least_loose_lag_s
-        own_lag_s = received_s - latest_end_s(interval, rules)
-        by_lag_s = (own_lag_s if lag_s is None else min(lag_s, own_lag_s)) - rules.prompt_delay_s
-        low_s = max(low_s, by_lag_s) if self.sync is None else min(low_s, by_lag_s)
-        if self.least_lag_s is not None:
-            high_s = min(high_s, self.least_lag_s)
-        if low_s > high_s + rules.jump_tolerance_s:
+        agrees = all(made.agrees_with(before, rules) for before in self.comparisons[-1:])
+        if self.contradicted or not agrees:
+            return ScannerClock((made,), set_at_s=made.at_s)
+        return replace(self, comparisons=(*self.comparisons, made), suspicion="", lags_s=())
+
+    def bounds_for(self, slice_: Received, rules: ClockRules) -> Offset:
+        """Between which bounds the offset lay when this slice was acquired."""
+        against = self.contradicted or self.suspicion
+        if against:
+            return OffsetUnknown(f"{against}: {_WHAT_TO_DO}")
+        if self.set_at_s is not None and slice_.received_s < self.set_at_s + rules.on_the_way_s:
+            return OffsetUnknown(
+                "it may have been acquired before the scanner's clock was set: scan again, or "
+                "confirm at which hold this acquisition was made"
+            )
+        lows = [
+            bounds.low_s
+            for bounds in (self.by_comparison(slice_, rules), self._by_promptness(slice_, rules))
+            if bounds is not None
+        ]
+        if not lows:
+            return OffsetUnknown(f"{self._why_unknown(slice_, rules)}: {_WHAT_TO_DO}")
+        return OffsetBounds(min(lows), max(self._high_s(slice_, rules), min(lows)))
+
+    def _high_s(self, slice_: Received, rules: ClockRules) -> float:
+        compared = self.by_comparison(slice_, rules)
+        upper_s = slice_.most_lag_s if self.upper_s is None else self.upper_s
+        return upper_s if compared is None else min(upper_s, compared.high_s)
+
+    def by_comparison(self, slice_: Received, rules: ClockRules) -> OffsetBounds | None:
+        """What the comparison says that was made nearest to this slice in time."""
+        if not self.comparisons:
             return None
-        return OffsetBounds(min(low_s, high_s), high_s)
+        at_s = slice_.received_s
+        nearest = min(self.comparisons, key=lambda made: abs(at_s - made.at_s))
+        if not slice_.synchronized and abs(at_s - nearest.at_s) > rules.comparison_valid_s:
+            return None
+        ppm = rules.synchronized_drift_ppm if slice_.synchronized else rules.drift_ppm
+        return nearest.bounds_at(at_s, ppm)
 
-    def least_possible_lag_s(self, now_s: float, rules: ClockRules) -> float:
-        """A slice with a smaller lag than this proves that the scanner's clock went forward."""
-        low_s, _ = self._believed(now_s, rules)
-        if self.least_prompt_lag_s is not None:
-            low_s = max(low_s, self.least_prompt_lag_s - rules.prompt_delay_s)
-        return low_s - rules.jump_tolerance_s
+    def _by_promptness(self, slice_: Received, rules: ClockRules) -> OffsetBounds | None:
+        """Its own lag always counts: the clock may have gone forward since the other slices.
 
-    def _believed(self, now_s: float, rules: ClockRules) -> tuple[float, float]:
-        """Bounds of the offset before any slice was seen."""
-        if self.sync is None:
-            return -rules.largest_offset_s, rules.largest_offset_s
-        age_s = abs(now_s - self.sync.at_s)
-        half_s = self.sync.uncertainty_s + age_s * rules.drift_ppm * 1e-6
-        return self.sync.offset_s - half_s, self.sync.offset_s + half_s
+        Beside a comparison the slices before it need not bear witness.
+        """
+        if rules.promptness is None:
+            return None
+        if not self.is_witnessed(rules) and self.by_comparison(slice_, rules) is None:
+            return None
+        lag_s = slice_.least_lag_s(rules)
+        if self.least_lags:
+            lag_s = min(lag_s, self.least_lags[0][0])
+        return OffsetBounds(lag_s - rules.promptness.most_s, lag_s)
+
+    def is_witnessed(self, rules: ClockRules) -> bool:
+        """Whether the least late slices came as nearly together as was measured."""
+        lags = self.least_lags[: rules.witnesses]
+        if rules.promptness is None or len(lags) < rules.witnesses:
+            return False
+        range_s = rules.promptness.most_s - rules.promptness.least_s + rules.jump_tolerance_s
+        if not all(certain for _, certain in lags):
+            range_s += rules.longest_acquisition_s
+        return lags[-1][0] - lags[0][0] <= range_s
+
+    def _why_unknown(self, slice_: Received, rules: ClockRules) -> str:
+        if rules.promptness is not None:
+            return f"no {rules.witnesses} slices came as promptly as was measured at this site"
+        if self.comparisons:
+            age_min = abs(slice_.received_s - self.comparisons[-1].at_s) / 60
+            return f"the clocks were compared {age_min:.0f} min away from it"
+        return "the clocks have not been compared"
 
 
 @dataclass(frozen=True)
 class Observation:
-    """The clock after a slice was seen, and the alarm that it gave, if any."""
+    """The clock after a slice was seen, and the alarms that it gave, if any."""
 
     clock: ScannerClock
     jump: str = ""
     late: str = ""
+    unlike: str = ""
 
 
-def observe(
-    clock: ScannerClock, interval: AcquisitionInterval, received_s: float, rules: ClockRules
-) -> Observation:
+def observe(clock: ScannerClock, slice_: Received, rules: ClockRules) -> Observation:
     """Take one more slice into account.
 
-    A lag below what the bounds allow is impossible unless the scanner's clock was set forward:
-    everything known is dropped, and this slice is the first evidence of the new time.
+    A lag below what is believed is impossible unless the scanner's clock was set forward, or what
+    is believed was wrong: nothing is assigned by it until somebody has compared the clocks again.
     """
-    lag_s = received_s - earliest_end_s(interval)
-    least_s = clock.least_possible_lag_s(received_s, rules)
-    if lag_s < least_s:
-        text = f"the scanner's clock is at least {least_s - lag_s:.1f} s ahead of before"
-        return Observation(_seen(ScannerClock(), interval, received_s, rules), jump=text)
-    late = ""
-    bounds = clock.bounds_for(interval, received_s, rules)
-    if bounds is not None:
-        delay_s = received_s - latest_end_s(interval, rules) - bounds.high_s
-        if delay_s > rules.late_limit_s:
-            late = f"received {delay_s:.1f} s after the acquisition, or its clock was set back"
-    return Observation(_seen(clock, interval, received_s, rules), late=late)
+    jump = _contradiction(clock, slice_, rules)
+    sooner = "" if jump else _break_of_habit(clock, slice_)
+    late = "" if jump else _lateness(clock, slice_, rules)
+    seen = replace(
+        _with_lag(clock, slice_, rules),
+        contradicted=clock.contradicted or jump,
+        suspicion=clock.suspicion or sooner,
+    )
+    return Observation(seen, jump or sooner, late, _unlike_measured(clock, slice_, rules))
+
+
+def _contradiction(clock: ScannerClock, slice_: Received, rules: ClockRules) -> str:
+    lag_s = slice_.most_lag_s
+    compared = clock.by_comparison(slice_, rules)
+    if compared is not None:
+        least_s = 0.0 if rules.promptness is None else rules.promptness.least_s
+        ahead_s = compared.low_s + least_s - lag_s
+        if ahead_s > rules.jump_tolerance_s:
+            return f"the scanner's clock is at least {ahead_s:.1f} s ahead of the comparison"
+    if rules.promptness is not None and clock.is_witnessed(rules):
+        spread_s = rules.promptness.most_s - rules.promptness.least_s
+        ahead_s = clock.least_lags[0][0] - spread_s - lag_s
+        if ahead_s > rules.jump_tolerance_s:
+            return f"the scanner's clock is at least {ahead_s:.1f} s ahead of before"
+    return ""
+
+
+def _break_of_habit(clock: ScannerClock, slice_: Received) -> str:
+    """Slices that all came equally late, and one that did not: the clock may have gone forward."""
+    if len(clock.lags_s) < _LAGS_THAT_SHOW_A_HABIT or not _is_certain(slice_.interval):
+        return ""
+    least_s, most_s = min(clock.lags_s), max(clock.lags_s)
+    sooner_s = least_s - slice_.most_lag_s
+    if sooner_s <= _MUCH_SOONER_S + (most_s - least_s):
+        return ""
+    return (
+        f"it came {sooner_s:.1f} s sooner after its acquisition than any of the "
+        f"{len(clock.lags_s)} slices before it, or the scanner's clock went forward"
+    )
+
+
+def _lateness(clock: ScannerClock, slice_: Received, rules: ClockRules) -> str:
+    known = clock.by_comparison(slice_, rules)
+    high_s = clock.upper_s if known is None else known.high_s
+    if high_s is None:
+        return ""
+    delay_s = slice_.least_lag_s(rules) - high_s
+    if delay_s <= rules.late_limit_s:
+        return ""
+    return f"received {delay_s:.1f} s after the acquisition, or its clock was set back"
+
+
+def _unlike_measured(clock: ScannerClock, slice_: Received, rules: ClockRules) -> str:
+    """A slice that comes later than any did when the site was commissioned."""
+    promptness, known = rules.promptness, clock.by_comparison(slice_, rules)
+    if promptness is None or not _is_certain(slice_.interval):
+        return ""
+    if known is not None:
+        delay_s = slice_.most_lag_s - known.high_s
+    elif clock.upper_s is not None:
+        delay_s = slice_.most_lag_s - clock.upper_s + promptness.least_s
+    else:
+        return ""
+    if delay_s <= promptness.most_s + rules.jump_tolerance_s:
+        return ""
+    return (
+        f"received {delay_s:.1f} s after the acquisition; no slice came later than "
+        f"{promptness.most_s:.1f} s when this was measured"
+    )
+
+
+def _with_lag(clock: ScannerClock, slice_: Received, rules: ClockRules) -> ScannerClock:
+    lag = slice_.least_lag_s(rules), _is_certain(slice_.interval)
+    upper_s = slice_.most_lag_s
+    if clock.upper_s is not None:
+        upper_s = min(clock.upper_s, upper_s)
+    return replace(
+        clock,
+        least_lags=tuple(sorted((*clock.least_lags, lag)))[: rules.witnesses],
+        upper_s=upper_s,
+        lags_s=(*clock.lags_s, lag[0])[-_LAGS_KEPT:] if lag[1] else clock.lags_s,
+    )
 
 
 @dataclass(frozen=True)
 class Drift:
-    """The least lags at the beginning and of late, over `_DRIFT_SLICES` slices with certain ends.
+    """The least lags at the beginning and of late, over `_LAGS_KEPT` slices with certain ends.
 
     A clock that creeps shows in no single slice. Nor can it be told from slices that have come to
-    take longer; either way the promptness that everything rests on is no longer what it was.
+    take longer; either way what everything rests on is no longer what it was.
     """
 
     first_s: tuple[float, ...] = ()
     last_s: tuple[float, ...] = ()
 
-    def with_slice(self, interval: AcquisitionInterval, received_s: float) -> "Drift":
-        if interval.end_s is None or interval.estimated:
+    def with_slice(self, slice_: Received) -> "Drift":
+        if not _is_certain(slice_.interval):
             return self
-        lag_s = received_s - interval.end_s
-        if len(self.first_s) < _DRIFT_SLICES:
+        lag_s = slice_.most_lag_s
+        if len(self.first_s) < _LAGS_KEPT:
             return Drift((*self.first_s, lag_s))
-        return Drift(self.first_s, (*self.last_s, lag_s)[-_DRIFT_SLICES:])
+        return Drift(self.first_s, (*self.last_s, lag_s)[-_LAGS_KEPT:])
 
     @property
     def moved_s(self) -> float:
         """How much longer the lags have become; 0 until there are enough slices to say."""
-        if len(self.last_s) < _DRIFT_SLICES:
+        if len(self.last_s) < _LAGS_KEPT:
             return 0.0
         return min(self.last_s) - min(self.first_s)
-
-
-def _seen(
-    clock: ScannerClock, interval: AcquisitionInterval, received_s: float, rules: ClockRules
-) -> ScannerClock:
-    latest_lag_s = received_s - latest_end_s(interval, rules)
-    seen = replace(
-        clock, least_lag_s=_least(clock.least_lag_s, received_s - earliest_end_s(interval))
-    )
-    if _is_certain(interval):
-        return replace(seen, least_prompt_lag_s=_least(clock.least_prompt_lag_s, latest_lag_s))
-    return replace(seen, least_loose_lag_s=_least(clock.least_loose_lag_s, latest_lag_s))
 
 
 def earliest_end_s(interval: AcquisitionInterval) -> float:
@@ -203,7 +364,3 @@ def latest_end_s(interval: AcquisitionInterval, rules: ClockRules) -> float:
 
 def _is_certain(interval: AcquisitionInterval) -> bool:
     return interval.end_s is not None and not interval.estimated
-
-
-def _least(known: float | None, new: float) -> float:
-    return new if known is None else min(known, new)

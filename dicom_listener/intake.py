@@ -26,7 +26,7 @@ from dicom_listener.assign import (
     Pending,
     assign,
 )
-from dicom_listener.clock import ClockRules, Sync
+from dicom_listener.clock import ClockRules, Comparison
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.scanner_clocks import ScannerClocks
@@ -59,7 +59,7 @@ class IntakeRules:
     assign: AssignRules = field(default_factory=AssignRules)
     clock: ClockRules = field(default_factory=ClockRules)
     zone: tzinfo | None = None
-    sync: Sync | None = None
+    comparison: Comparison | None = None
 
 
 class Intake:
@@ -73,9 +73,10 @@ class Intake:
         self._rules = rules
         self._metrics = metrics
         self._decoder = DecodeGuard()
-        self._clocks = ScannerClocks(rules.clock, rules.sync)
+        self._clocks = ScannerClocks(rules.clock, rules.comparison)
         self._known: dict[int, Known] = {}
         self._pending: dict[int, Slice] = {}
+        self._clockless: set[int] = set()  # of those, the ones that wait for the clock to be known
         self._confirmed: set[int] = set()
         self._done: set[str] = set()
         self._seen_event_id = 0
@@ -97,6 +98,7 @@ class Intake:
             self._clocks.observe(slice_, row.received_s)
             if row.state == "pending":
                 self._pending[row.slice_id] = slice_
+                self._note_clockless(row.slice_id, row.reason_code)
             self._know(row.slice_id, slice_, row)
         self._read_events(replaying=True)
 
@@ -162,7 +164,19 @@ class Intake:
             self.alarm("intake_failed", f"{name}: {type(error).__name__}")
         self._write(rows, slices, envelope)
         self._done.add(name)
+        self._decide_pending()
         self._metrics.intake_seconds.observe(max(0.0, time.time() - envelope.received_s))
+
+    def set_aside(self, path: Path, text: str) -> None:
+        """Record one inbox file that is not to be read; for the rest as `take`."""
+        name = self._named(path)
+        if name in self._done or not path.exists():
+            return
+        envelope = self._envelope(path)
+        reason = SetAside(Reason.UNREADABLE, text)
+        self._write([row_without_header(envelope, name, reason)], [None], envelope)
+        self._done.add(name)
+        self.alarm("intake_failed", f"{name}: {text}")
 
     def alarm(self, kind: str, text: str) -> None:
         """Count, log and record something that a person should know of."""
@@ -275,6 +289,7 @@ class Intake:
                 continue
             if row.state == "pending":
                 self._pending[row.slice_id] = slice_
+                self._note_clockless(row.slice_id, row.reason_code)
             self._know(row.slice_id, slice_, row)
         if any(row.reason_code == Reason.UID_CONFLICT for row in rows):
             self.alarm("same_uid_other_bytes", f"{envelope.sop_instance_uid}: both are kept")
@@ -287,7 +302,7 @@ class Intake:
             if self._unheeded[0].wall_s > until_s:
                 return
             event = self._unheeded.popleft()
-            self._heed(event.kind, event.body, replaying)
+            self._heed(event, replaying)
 
     def _fetch_events(self) -> bool:
         events = self._record.events(self._seen_event_id, _EVENTS_AT_ONCE)
@@ -296,8 +311,9 @@ class Intake:
             self._unheeded.extend(events)
         return bool(events)
 
-    def _heed(self, kind: str, body: Any, replaying: bool) -> None:
-        self._clocks.heed(kind, body)
+    def _heed(self, event: Event, replaying: bool) -> None:
+        kind, body = event.kind, event.body
+        self._clocks.heed(kind, body, event.wall_s)
         if kind == "acquisition_confirmed":
             self._confirmed.add(int(body["hold_id"]))
         elif kind == "slice_reassigned" and not replaying:
@@ -311,7 +327,11 @@ class Intake:
             self._known[row.slice_id] = Known(slice_, row.received_s, row.hold_id, row.reason_code)
 
     def _decide_pending(self) -> None:
+        """Ask again for those that wait; for the clock's sake only when more is known of it."""
+        clock_news = self._clocks.take_news()
         for slice_id, slice_ in list(self._pending.items()):
+            if slice_id in self._clockless and not clock_news:
+                continue
             row = self._record.slice(slice_id)
             if row.state != "pending":
                 self._follow(row)
@@ -324,9 +344,14 @@ class Intake:
             ]
             decision = self._assign(slice_, row.received_s, [*earlier, *later])
             state, hold_id, code, text = outcome_of(decision)
-            if (state, code) == (row.state, row.reason_code):
+            self._note_clockless(slice_id, code)
+            if (state, code, text) == (row.state, row.reason_code, row.reason):
                 continue
             self._decide(row, decision, (state, hold_id, code, text))
+
+    def _note_clockless(self, slice_id: int, code: str) -> None:
+        waits = code == Reason.CLOCK_UNKNOWN
+        (self._clockless.add if waits else self._clockless.discard)(slice_id)
 
     def _decide(
         self, row: SliceRow, decision: Decision, outcome: tuple[str, int | None, str, str]

@@ -29,7 +29,7 @@ def sync_clock(record: CaseRecord, offset_s: float, uncertainty_s: float, who: s
 
 
 def reset_clock(record: CaseRecord, who: str, why: str = "") -> None:
-    """The scanner's clock was set: forget what was known of it, the next slices show it anew."""
+    """The scanner's clock was set: forget what was known of it, until the clocks are compared."""
     record.append_event("clock_reset", {"why": why}, source=_SOURCE, who=who)
 
 

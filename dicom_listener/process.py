@@ -12,11 +12,12 @@ from zoneinfo import ZoneInfo, ZoneInfoNotFoundError
 
 import structlog
 
+from case_record.attempts import MOST_DEATHS, Attempts
 from case_record.cases import Cases
 from case_record.presence import Presence, Sole
 from case_record.record import CaseRecord
 from dicom_listener.assign import AssignRules
-from dicom_listener.clock import ClockRules, Sync
+from dicom_listener.clock import ClockRules, Comparison, Promptness
 from dicom_listener.inbox import Inbox
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
@@ -44,6 +45,10 @@ class Ready:
     ae_title: str
 
 
+class ListeningEndedError(RuntimeError):
+    """Nothing is received any more: the process ends, so that it is started again."""
+
+
 class PortError(ConfigError):
     """The port cannot be bound: most often another process has it."""
 
@@ -69,11 +74,8 @@ def scp_rules(config: ListenerConfig) -> ScpRules:
     )
 
 
-def intake_rules(config: Config, now_s: float) -> IntakeRules:
+def intake_rules(config: Config) -> IntakeRules:
     listener = config.listener
-    sync = None
-    if listener.clock_offset_s is not None:
-        sync = Sync(listener.clock_offset_s, listener.clock_uncertainty_s, now_s)
     return IntakeRules(
         slices=SliceRules(
             coronal_tolerance_deg=config.imaging.coronal_tolerance_deg,
@@ -86,13 +88,30 @@ def intake_rules(config: Config, now_s: float) -> IntakeRules:
             arrival_mode=listener.arrival_mode,
         ),
         clock=ClockRules(
-            prompt_delay_s=listener.prompt_delay_s,
+            promptness=_promptness(listener),
             longest_acquisition_s=listener.longest_acquisition_s,
-            largest_offset_s=listener.largest_clock_offset_s,
             late_limit_s=listener.late_limit_s,
+            comparison_valid_s=60 * listener.comparison_valid_min,
         ),
         zone=_zone(listener.scanner_time_zone),
-        sync=sync,
+        comparison=_comparison(listener),
+    )
+
+
+def _promptness(listener: ListenerConfig) -> Promptness | None:
+    if listener.prompt_delay_s is None:
+        return None
+    return Promptness(listener.least_delay_s, listener.prompt_delay_s)
+
+
+def _comparison(listener: ListenerConfig) -> Comparison | None:
+    """As the room's file states it, made when the file says (`load_config` sees to that)."""
+    if listener.clock_offset_s is None or listener.clock_compared_at is None:
+        return None
+    return Comparison(
+        listener.clock_offset_s,
+        listener.clock_uncertainty_s,
+        listener.clock_compared_at.timestamp(),
     )
 
 
@@ -139,7 +158,7 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             inbox_folder(case_dir),
             min_free_bytes=config.listener.min_free_mib * _MIB,
         )
-        rules = intake_rules(config, time.time())
+        rules = intake_rules(config)
         scp = open_scp(config.listener, inbox, metrics, received.put)
         stack.callback(scp.stop)
         discarded = inbox.discard_unfinished()
@@ -164,7 +183,8 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         presence = stack.enter_context(Presence(case_dir, "listener"))
         retention_s = config.listener.retention_days * 86400
         tending = Tending(record, inbox, intake, retention_s)
-        _loop(intake, scp, tending, received, stop, presence)
+        attempts = stack.enter_context(Attempts(case_dir, "listener"))
+        _loop(intake, scp, tending, received, stop, presence, attempts)
 
 
 def _loop(
@@ -174,20 +194,26 @@ def _loop(
     received: "SimpleQueue[Path]",
     stop: threading.Event,
     presence: Presence,
+    attempts: Attempts,
 ) -> None:
     while not stop.is_set():
         presence.beat()
+        if not scp.is_listening:
+            raise ListeningEndedError("the thread that listens on the port has ended")
         try:
-            _take_received(intake, received)
+            _take_received(intake, received, attempts)
             intake.look_at_record()
             while scp.alarms:
                 intake.note_alarm(*scp.alarms.popleft())
             tending.turn()
-        except sqlite3.Error as error:
+        except (sqlite3.Error, OSError) as error:
             # The slices are safe in the inbox: tried again until the record can be written.
             log.error("the case record cannot be written", error=str(error))
             stop.wait(_RECORD_RETRY_S)
             _requeue(intake, received)
+        except Exception:  # receiving and storing go on, whatever the rest of the loop meets
+            log.exception("the listener's loop")
+            stop.wait(_RECORD_RETRY_S)
 
 
 class Tending:
@@ -224,12 +250,23 @@ def _requeue(intake: Intake, received: "SimpleQueue[Path]") -> None:
         received.put(path)
 
 
-def _take_received(intake: Intake, received: "SimpleQueue[Path]") -> None:
+def _take_received(intake: Intake, received: "SimpleQueue[Path]", attempts: Attempts) -> None:
     """Wait for at most one poll, then take whatever is there."""
     try:
         path = received.get(timeout=_POLL_S)
         while True:
-            intake.take(path)
+            _take(intake, path, attempts)
             path = received.get_nowait()
     except Empty:
         return
+
+
+def _take(intake: Intake, path: Path, attempts: Attempts) -> None:
+    """One file; one over which the listener was killed again and again is not read any more."""
+    deaths = attempts.deaths(path.name)
+    if deaths >= MOST_DEATHS:
+        intake.set_aside(path, f"the listener ended {deaths} times while it read this file")
+        attempts.forget(path.name)
+        return
+    with attempts.at(path.name):
+        intake.take(path)

@@ -3,36 +3,57 @@
 from collections.abc import Mapping
 from typing import Any
 
-from dicom_listener.clock import ClockRules, Drift, OffsetBounds, ScannerClock, Sync, observe
+from dicom_listener.clock import (
+    ClockRules,
+    Comparison,
+    Drift,
+    Offset,
+    OffsetUnknown,
+    Received,
+    ScannerClock,
+    observe,
+)
 from dicom_slice.header import Slice
+
+_COMPARE = "compare the clocks"
 
 
 class ScannerClocks:
-    """Learns from every slice, and from what operators say: a sync, or a reset."""
+    """Learns from every slice, and from what operators say: a comparison, or a reset."""
 
-    def __init__(self, rules: ClockRules, sync: Sync | None) -> None:
+    def __init__(self, rules: ClockRules, comparison: Comparison | None) -> None:
         self._rules = rules
-        self._sync = sync
+        self._unseen = ScannerClock()  # of a scanner that has not sent yet
+        if comparison is not None:
+            self._unseen = self._unseen.compared(comparison, rules)
         self._clocks: dict[str, ScannerClock] = {}
         self._drifts: dict[str, Drift] = {}
         self._standing: set[tuple[str, str]] = set()  # alarms that are raised once, while they last
+        self._has_news = False
 
     def observe(self, slice_: Slice, received_s: float) -> list[tuple[str, str]]:
         """Take one more slice into account; return the alarms that it gives, as (kind, text)."""
-        if slice_.interval is None:
+        received = _received(slice_, received_s)
+        if received is None:
             return []
-        clock = self._clocks.get(slice_.scanner, ScannerClock(sync=self._sync))
-        seen = observe(clock, slice_.interval, received_s, self._rules)
-        self._clocks[slice_.scanner] = seen.clock
-        known = Drift() if seen.jump else self._drifts.get(slice_.scanner, Drift())
-        drift = self._drifts[slice_.scanner] = known.with_slice(slice_.interval, received_s)
-        alarms = [("clock_jump", seen.jump)] if seen.jump else []
-        alarms += self._standing_alarm("late_or_clock_jump", slice_.scanner, seen.late)
-        alarms += self._standing_alarm("clock_drift", slice_.scanner, self._drift_text(drift))
-        return [
-            (kind, f"{slice_.scanner}: {text}; compare the clocks, or reset what is known of it")
-            for kind, text in alarms
+        scanner = slice_.scanner
+        before = self._clock(scanner)
+        seen = observe(before, received, self._rules)
+        self._clocks[scanner] = seen.clock
+        is_new = not before.is_witnessed(self._rules) and seen.clock.is_witnessed(self._rules)
+        self._has_news |= is_new
+        drift = self._drifts.get(scanner, Drift()).with_slice(received)
+        self._drifts[scanner] = drift
+        alarms = [
+            *self._standing_alarm("clock_jump", scanner, seen.jump),
+            *self._standing_alarm("late_or_clock_jump", scanner, seen.late),
+            *self._standing_alarm("push_delay_unlike_measured", scanner, seen.unlike),
+            *self._standing_alarm("clock_drift", scanner, self._drift_text(drift)),
         ]
+        return [(kind, f"{scanner}: {text}; {_COMPARE}") for kind, text in alarms]
+
+    def _clock(self, scanner: str) -> ScannerClock:
+        return self._clocks.get(scanner, self._unseen)
 
     def _drift_text(self, drift: Drift) -> str:
         if abs(drift.moved_s) <= self._rules.drift_alarm_s:
@@ -47,20 +68,37 @@ class ScannerClocks:
         (self._standing.add if text else self._standing.discard)((kind, scanner))
         return [(kind, text)] if text and not was_standing else []
 
-    def offset(self, slice_: Slice, received_s: float) -> OffsetBounds | None:
-        """Between which bounds the offset lies for this slice; None where it is not known."""
-        clock = self._clocks.get(slice_.scanner)
-        if clock is None or slice_.interval is None:
-            return None
-        return clock.bounds_for(slice_.interval, received_s, self._rules)
+    def offset(self, slice_: Slice, received_s: float) -> Offset:
+        """Between which bounds the offset lies for this slice, or what would make it known."""
+        received = _received(slice_, received_s)
+        if received is None:
+            return OffsetUnknown("the header has no acquisition time")
+        return self._clock(slice_.scanner).bounds_for(received, self._rules)
 
-    def heed(self, kind: str, body: Mapping[str, Any]) -> None:
+    def heed(self, kind: str, body: Mapping[str, Any], wall_s: float) -> None:
         """Follow an event of the record, where it concerns clocks."""
         if kind == "clock_sync":
-            self._sync = Sync(body["offset_s"], body["uncertainty_s"], body["at_s"])
-            self._clocks = {scanner: ScannerClock(sync=self._sync) for scanner in self._clocks}
-            self._drifts.clear()
+            made = Comparison(body["offset_s"], body["uncertainty_s"], body["at_s"])
+            self._unseen = self._unseen.compared(made, self._rules)
+            self._clocks = {
+                name: clock.compared(made, self._rules) for name, clock in self._clocks.items()
+            }
         elif kind == "clock_reset":
-            self._sync = None
+            self._unseen = ScannerClock(set_at_s=wall_s)
             self._clocks.clear()
-            self._drifts.clear()
+        else:
+            return
+        self._drifts.clear()
+        self._standing.clear()
+        self._has_news = True
+
+    def take_news(self) -> bool:
+        """Whether slices that waited for the clock to be known are to be asked for again."""
+        news, self._has_news = self._has_news, False
+        return news
+
+
+def _received(slice_: Slice, received_s: float) -> Received | None:
+    if slice_.interval is None:
+        return None
+    return Received(slice_.interval, received_s, slice_.clock_synchronized is True)

@@ -99,6 +99,10 @@ class Scp:
     def port(self) -> int:
         return int(self._server.server_address[1])
 
+    @property
+    def is_listening(self) -> bool:
+        return self._thread.is_alive()
+
     def start(self) -> None:
         self._thread.start()
 
@@ -142,6 +146,8 @@ class Scp:
             "network_timeout_s": rules.network_timeout_s,
             "first_byte_timeout_s": rules.acse_timeout_s,
             "most_unopened": 4 * rules.max_associations,
+            "most_associations": rules.max_associations,
+            "is_known": staticmethod(self._is_known),
             "on_dropped": staticmethod(self._on_dropped),
         }
         return type("RoomServer", (PromptServer,), settings)
@@ -160,6 +166,16 @@ class Scp:
         event.assoc.acse.send_reject(*code)
         self._reject(report_of(event.assoc, why))
         event.assoc.kill()
+
+    def _is_known(self, peer: str) -> bool:
+        """Whether the address may send; one that cannot be told may not keep others out either."""
+        if not self._networks:
+            return True
+        try:
+            address = address_of(peer)
+        except ValueError:
+            return False
+        return any(address in network for network in self._networks)
 
     def _why_refused(self, association: Any) -> tuple[tuple[int, int, int], str] | None:
         request = association.requestor.primitive

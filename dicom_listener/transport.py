@@ -12,7 +12,6 @@ import contextlib
 import selectors
 import socket
 import ssl
-import threading
 import time
 from collections.abc import Callable
 from socketserver import TCPServer
@@ -22,9 +21,11 @@ from pynetdicom.association import Association
 from pynetdicom.timer import Timer
 from pynetdicom.transport import AssociationSocket, RequestHandler, ThreadedAssociationServer
 
+from dicom_listener.lobby import Lobby, NoRequestError, await_request
+
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)
 _CHUNK_BYTES = 256 * 1024
-_ASSOCIATE_RQ = 0x01
+_MAY_BE_SILENT_S = 2.0
 
 
 def acknowledge_at_once(sock: socket.socket) -> None:
@@ -48,6 +49,7 @@ class BoundedSocket(AssociationSocket):
         super().__init__(assoc, client_socket=client_socket)
         self.message_bytes = 0
         self.message_began_s: float | None = None
+        self.heard_s = time.monotonic()
 
     def message_done(self) -> float | None:
         """Start counting anew; return the monotonic instant of the message's first byte."""
@@ -69,6 +71,7 @@ class BoundedSocket(AssociationSocket):
             if not piece:
                 break
             acknowledge_at_once(sock)
+            self.heard_s = time.monotonic()
             received += piece
             if len(received) < nr_bytes and time.monotonic() > deadline_s:
                 self._refuse(f"a PDU took longer than {self.pdu_deadline_s:g} s")
@@ -150,10 +153,12 @@ class PromptServer(ThreadedAssociationServer):
     network_timeout_s = 60.0
     first_byte_timeout_s = 10.0
     most_unopened = 64
+    most_associations = 16
+    is_known: Callable[[str], bool] = staticmethod(lambda peer: True)
     on_dropped: Callable[[str, str], None] = staticmethod(lambda peer, why: None)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
-        self._unopened = threading.BoundedSemaphore(self.most_unopened)
+        self._lobby = Lobby(self.most_unopened)
         kwargs["request_handler"] = PromptRequestHandler
         super().__init__(*args, **kwargs)
         self.contexts: SharedContexts = SharedContexts(self.contexts)
@@ -164,18 +169,19 @@ class PromptServer(ThreadedAssociationServer):
         return self.socket.accept()
 
     def process_request(self, request: Any, client_address: Any) -> None:
-        if not self._unopened.acquire(blocking=False):
-            self.on_dropped(client_address[0], "too many connections that say nothing")
-            self.shutdown_request(request)
-            return
+        peer = client_address[0]
+        gone = self._lobby.enter(request, peer, is_known=self.is_known(peer))
+        if gone is not None:
+            self.on_dropped(gone, "too many connections that say nothing")
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
         try:
             opened = self._open(request, client_address[0])
         finally:
-            self._unopened.release()
+            self._lobby.leave(request)
         if opened is not None:
+            self._make_room(client_address[0])
             super().process_request_thread(opened, client_address)
 
     def _open(self, request: socket.socket, peer: str) -> socket.socket | None:
@@ -190,21 +196,30 @@ class PromptServer(ThreadedAssociationServer):
                 sock = self.ssl_context.wrap_socket(sock, server_side=True)
                 _wait_readable(sock, self.first_byte_timeout_s)
             else:
-                first = sock.recv(1, socket.MSG_PEEK)
-                if not first:
-                    self.on_dropped(peer, "closed without a word")
-                    self.shutdown_request(request)
-                    return None
-                if first[0] != _ASSOCIATE_RQ:
-                    self.on_dropped(peer, f"not DICOM: first byte 0x{first[0]:02X}")
-                    self.shutdown_request(request)
-                    return None
+                await_request(sock, self.first_byte_timeout_s)
             sock.settimeout(self.network_timeout_s)
+        except NoRequestError as error:
+            self.on_dropped(peer, str(error))
+            self.shutdown_request(sock)
+            return None
         except OSError as error:  # TLS errors and timeouts are OSErrors too
             self.on_dropped(peer, f"{type(error).__name__}: {error}")
             self.shutdown_request(sock)
             return None
         return sock
+
+    def _make_room(self, peer: str) -> None:
+        """Where all associations are taken, end the one that has been silent for longest."""
+        taken = [a for a in self.active_associations if a.is_established]
+        if len(taken) < self.most_associations:
+            return
+        silent = {a: _silent_s(a) for a in taken}
+        longest = max(silent, key=lambda a: silent[a])
+        if silent[longest] < _MAY_BE_SILENT_S:
+            return  # all of them are at work: the new one is refused, and says so
+        self.on_dropped(longest.requestor.address, f"silent, and {peer} wants in")
+        with contextlib.suppress(Exception):  # it may end by itself in this very moment
+            longest.abort()
 
     def shutdown(self) -> None:
         """Stop listening. (pynetdicom's own would look for us in a list that it did not fill.)"""
@@ -213,6 +228,11 @@ class PromptServer(ThreadedAssociationServer):
 
     def handle_error(self, request: Any, client_address: Any) -> None:
         self.on_dropped(client_address[0], "failed to start an association")
+
+
+def _silent_s(association: Association) -> float:
+    heard_s = getattr(association.dul.socket, "heard_s", None)
+    return 0.0 if heard_s is None else time.monotonic() - heard_s
 
 
 def _wait_readable(sock: socket.socket, timeout_s: float) -> None:

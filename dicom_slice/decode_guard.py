@@ -6,6 +6,7 @@ pixels are decoded in this process.
 
 import json
 import os
+import resource
 import selectors
 import subprocess
 import sys
@@ -16,6 +17,7 @@ from dicom_slice.header import Slice, read_header
 from dicom_slice.pixels import check_pixels
 from dicom_slice.reasons import Reason, UnusableError
 
+_MOST_MEMORY_BYTES = 2 * 2**30
 _UNCOMPRESSED = (
     "",
     "1.2.840.10008.1.2",
@@ -28,7 +30,7 @@ _UNCOMPRESSED = (
 class DecodeGuard:
     """Owns the child process, which is started when it is first needed, and again if it died."""
 
-    def __init__(self, *, deadline_s: float = 60.0) -> None:
+    def __init__(self, *, deadline_s: float = 15.0) -> None:
         self._deadline_s = deadline_s
         self._child: subprocess.Popen[bytes] | None = None
 
@@ -100,6 +102,8 @@ def _answer(path: Path) -> dict[str, list[str]]:
 
 def main() -> None:
     """The child: one path a line on standard input, one JSON object a line on standard output."""
+    # a picture may say that it is larger than all the memory there is
+    resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY_BYTES, _MOST_MEMORY_BYTES))
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # codecs print; their words must not be taken for answers
     for line in sys.stdin.buffer:

@@ -6,12 +6,14 @@ one plain reading is read, with a warning kept beside it; what has none is absen
 
 import math
 from collections.abc import Callable
+from itertools import islice
 from typing import Any
 
 from pydicom.datadict import keyword_for_tag, tag_for_keyword
 from pydicom.dataset import Dataset
 from pydicom.tag import Tag
 
+_MOST_ITEMS = 1_000  # as many as frames are taken
 Key = str | tuple[int, int]
 
 
@@ -98,7 +100,8 @@ class Elements:
         if value is None or isinstance(value, (str, bytes)):
             return []
         try:
-            return [self._within(item) for item in value if isinstance(item, Dataset)]
+            items = [item for item in islice(value, _MOST_ITEMS) if isinstance(item, Dataset)]
+            return [self._within(item) for item in items]
         except TypeError:
             return []
 

@@ -14,6 +14,7 @@ from pydicom.dataset import Dataset, FileDataset
 from pydicom.errors import InvalidDicomError
 
 from dicom_slice import quirks
+from dicom_slice.bounds import check_bounds
 from dicom_slice.elements import Elements, FrameElements, frame_elements
 from dicom_slice.geometry import SliceGeometry
 from dicom_slice.patient import patient_digest
@@ -27,7 +28,7 @@ from dicom_slice.times import (
 )
 
 _LARGEST_SIDE_PX = 8192
-_MOST_FRAMES = 10_000
+_MOST_FRAMES = 1_000
 _NO_TIME_FRAME = TimeFrame()
 
 
@@ -114,7 +115,10 @@ def dcmread_checked(path: Path, **options: Any) -> FileDataset:
     if not path.is_file():
         raise UnusableError(Reason.NOT_DICOM, f"{path}: no such file")
     try:
+        check_bounds(path)
         data_set = dcmread(path, force=not _is_part10(path), **options)
+    except UnusableError:
+        raise
     except (InvalidDicomError, EOFError) as error:
         raise UnusableError(Reason.NOT_DICOM, f"{path}: not DICOM ({error})") from error
     except OSError as error:
@@ -173,9 +177,10 @@ def _slices_of(data_set: Dataset, times: TimeFrame, noted: list[str]) -> list[Sl
         raise UnusableError(Reason.NO_PIXELS, "no pixels: Rows and Columns are missing")
     n_frames = top.integer("NumberOfFrames") or 1
     if not (0 < rows <= _LARGEST_SIDE_PX and 0 < cols <= _LARGEST_SIDE_PX):
-        raise UnusableError(Reason.UNREADABLE, f"absurd size: {rows} x {cols} pixels")
+        raise UnusableError(Reason.TOO_LARGE, f"absurd size: {rows} x {cols} pixels")
     if not 0 < n_frames <= _MOST_FRAMES:
-        raise UnusableError(Reason.UNREADABLE, f"absurd number of frames: {n_frames}")
+        text = f"{n_frames} frames, 1 to {_MOST_FRAMES} are taken"
+        raise UnusableError(Reason.TOO_LARGE, text)
     return [_slice(top, frame, n_frames, (rows, cols), times) for frame in range(n_frames)]
 
 

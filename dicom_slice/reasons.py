@@ -10,6 +10,7 @@ class Reason(StrEnum):
     # The file
     NOT_DICOM = "not_dicom"
     UNREADABLE = "unreadable"
+    TOO_LARGE = "too_large"
     NOT_MR = "not_mr"
     NO_PIXELS = "no_pixels"
     UNDECODABLE = "undecodable_pixels"

@@ -18,6 +18,7 @@ _NOT_MAGNITUDE = {
 class SliceRules:
     """What a room accepts. coronal_tolerance_deg None: any orientation.
 
+    most_pixels: of one slice; the engine's time and memory grow with them.
     distortion_corrected: None accepts either; within a case they are never mixed (`assign`).
     """
 
@@ -27,6 +28,7 @@ class SliceRules:
     allow_localizer: bool = False
     need_geometry: bool = True
     distortion_corrected: bool | None = None
+    most_pixels: int | None = 2048**2
 
 
 #: For files that a person named by hand: any orientation, derived and real images too.
@@ -36,6 +38,7 @@ BY_HAND = SliceRules(
     allow_derived=True,
     allow_localizer=True,
     need_geometry=False,
+    most_pixels=None,
 )
 
 
@@ -48,6 +51,10 @@ def why_not_usable(slice_: Slice, rules: SliceRules) -> SetAside | None:
 def _wrong_pixels(slice_: Slice, rules: SliceRules) -> SetAside | None:
     if slice_.samples_per_pixel != 1:
         return SetAside(Reason.COLOUR, f"{slice_.samples_per_pixel} samples a pixel: colour")
+    rows, cols = slice_.shape
+    if rules.most_pixels is not None and rows * cols > rules.most_pixels:
+        text = f"{rows} x {cols} pixels, at most {rules.most_pixels} are used"
+        return SetAside(Reason.TOO_LARGE, text)
     if not slice_.has_pixels:
         return SetAside(Reason.NO_PIXELS, "no pixels")
     return None

@@ -2,7 +2,7 @@
 
 from pathlib import Path
 
-from pydantic import Field, model_validator
+from pydantic import AwareDatetime, Field, model_validator
 
 from room_config.section import Section
 
@@ -53,11 +53,17 @@ class ListenerConfig(Section):
         ge=0,
         description="A hold is shrunk by this at both ends before a slice may belong to it.",
     )
-    prompt_delay_s: float = Field(
-        default=3.0,
+    prompt_delay_s: float | None = Field(
+        default=None,
         gt=0,
-        description="The promptest slice arrives this soon after its acquisition ended; bounds "
-        "the offset of the scanner's clock where no sync is given.",
+        description="No slice arrives later than this after its acquisition ended, as measured at "
+        "this site (`autospine commission`). Absent: not measured, and nothing is believed of it.",
+    )
+    least_delay_s: float = Field(
+        default=0.0,
+        ge=0,
+        description="No slice arrives sooner than this after its acquisition ended, measured with "
+        "prompt_delay_s.",
     )
     longest_acquisition_s: float = Field(
         default=30.0,
@@ -65,21 +71,27 @@ class ListenerConfig(Section):
         description="No acquisition lasts longer that comes without its duration; a slice without "
         "one is used only after the robot has stood that long.",
     )
-    largest_clock_offset_s: float = Field(
-        default=600.0,
-        gt=0,
-        description="Without clock_offset_s: a scanner's clock further off is not believed.",
-    )
     late_limit_s: float = Field(
         default=120.0,
         gt=0,
         description="A slice that seems later than this is set aside: its clock may have jumped.",
     )
     clock_offset_s: float | None = Field(
-        default=None, description="Explicit sync: our clock minus the scanner's."
+        default=None, description="A comparison of the clocks: ours minus the scanner's."
     )
     clock_uncertainty_s: float = Field(
         default=1.0, ge=0, description="Uncertainty of clock_offset_s."
+    )
+    clock_compared_at: AwareDatetime | None = Field(
+        default=None,
+        description="When clock_offset_s was measured, with its offset from UTC; absent: when "
+        "this file was last written.",
+    )
+    comparison_valid_min: float = Field(
+        default=60.0,
+        gt=0,
+        description="A comparison of the clocks counts for so long; after it slices wait until "
+        "somebody compares again. A scanner that says that its clock is synchronized is exempt.",
     )
     arrival_mode: bool = Field(
         default=False,
@@ -93,6 +105,14 @@ class ListenerConfig(Section):
     retention_days: float = Field(
         default=0.0, ge=0, description="Remove set-aside files after so many days; 0: keep all."
     )
+
+    @model_validator(mode="after")
+    def _delays_are_in_order(self) -> "ListenerConfig":
+        if self.prompt_delay_s is None and self.least_delay_s:
+            raise ValueError("least_delay_s is measured with prompt_delay_s: give both")
+        if self.prompt_delay_s is not None and not self.least_delay_s <= self.prompt_delay_s:
+            raise ValueError("least_delay_s must not be more than prompt_delay_s")
+        return self
 
     @model_validator(mode="after")
     def _tls_is_whole(self) -> "ListenerConfig":

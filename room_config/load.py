@@ -10,6 +10,7 @@ import difflib
 import os
 import tomllib
 from collections.abc import Mapping
+from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -62,8 +63,17 @@ def load_config(path: Path, environment: Mapping[str, str] = os.environ) -> Conf
     here = path.parent
     update: dict[str, BaseModel] = {n: _absolute(section, here) for n, section in sections.items()}
     sent_to = [_absolute(one, here) for one in config.outputs.destination]
+    update["listener"] = _with_instant_of_comparison(update["listener"], path)
     update["outputs"] = config.outputs.model_copy(update={"destination": sent_to})
     return config.model_copy(update=update)
+
+
+def _with_instant_of_comparison(listener: Model, path: Path) -> Model:
+    """A comparison of the clocks in the file is no younger than the file."""
+    if not isinstance(listener, ListenerConfig) or listener.clock_compared_at is not None:
+        return listener
+    written = datetime.fromtimestamp(path.stat().st_mtime, UTC)
+    return listener.model_copy(update={"clock_compared_at": written})
 
 
 def _absolute(section: Model, folder: Path) -> Model:

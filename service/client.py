@@ -264,7 +264,7 @@ class RoomClient:
         self._order("PUT", "/api/v1/clock", offset_s=offset_s, uncertainty_s=uncertainty_s)
 
     def forget_clock(self, why: str = "") -> None:
-        """The scanner's clock was set: the next slices show it anew."""
+        """The scanner's clock was set: slices wait until the clocks are compared."""
         self._order("POST", "/api/v1/clock/reset", why=why)
 
     def give_up_slices(self, hold_id: int, why: str = "") -> None:

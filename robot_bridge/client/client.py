@@ -7,7 +7,7 @@ from inside `pump` and the calls that block (`open`, `move`, ...), never from a 
 
 import secrets
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 from robot_bridge.client.client_motion import OnState, refused, see_through
 from robot_bridge.client.client_values import (
@@ -145,13 +145,47 @@ class BridgeClient:
         """Lock before READY, unlock when the needle is out. Locking stops a running motion."""
         self._ask(messages.SetInsertionLock(locked=locked, by=by, seen_ms=self._session.seen_ms()))
 
-    def declare_position(self, positions_um: Mapping[str, int], by: str) -> None:
-        """The robot stands at these positions (measured); positions are certain afterwards."""
-        positions = _checked_um(positions_um)
+    def declare_position(
+        self,
+        positions_um: Mapping[str, int],
+        by: str,
+        within_um: Mapping[str, int] | None = None,
+    ) -> None:
+        """The named axes, and no others, stand there, give or take `within_um`; certain afterwards.
+
+        Without a bound the word counts as exact, unless it only repeats what `status` remembers.
+        """
         self._ask(
-            messages.DeclarePosition(positions_um=positions, by=by, seen_ms=self._session.seen_ms())
+            messages.DeclarePosition(
+                positions_um=_checked_um(positions_um),
+                by=by,
+                seen_ms=self._session.seen_ms(),
+                within_um=_checked_um(within_um or {}),
+            )
         )
         self._session.known_motion = self.status.last_motion
+
+    def correct_position(
+        self,
+        correction_um: Mapping[str, int],
+        within_um: Mapping[str, int],
+        *,
+        based_on_motion: str | None = None,
+    ) -> None:
+        """Images say that axes stand `correction_um` beyond their count, give or take `within_um`.
+
+        Counts and setpoints stay what they are; only the travel that is left changes.
+        based_on_motion: `last_motion` when that was seen (default: the last one known here).
+        """
+        known = self._session.known_motion
+        self._ask(
+            messages.CorrectPosition(
+                correction_um=_checked_um(correction_um),
+                within_um=_checked_um(within_um),
+                based_on_motion=known if based_on_motion is None else based_on_motion,
+                seen_ms=self._session.seen_ms(),
+            )
+        )
 
     def _ask(self, request: messages.Message) -> None:
         """A request that is done or refused at once; afterwards `status` shows its effect."""
@@ -197,9 +231,14 @@ class BridgeClient:
         )
         return see_through(self._session, request, self.pump, on_state)
 
-    def home(self, command_id: str, by: str) -> MoveOutcome:
-        """Search the axes' references; afterwards positions are certain. Blocks like `move`."""
-        request = messages.Home(command_id=command_id, by=by, seen_ms=self._session.seen_ms())
+    def home(self, command_id: str, by: str, axes: Sequence[str] = ()) -> MoveOutcome:
+        """Search the references of these axes (none named: all), which are certain afterwards.
+
+        Blocks like `move`.
+        """
+        request = messages.Home(
+            command_id=command_id, by=by, seen_ms=self._session.seen_ms(), axes=tuple(axes)
+        )
         return see_through(self._session, request, self.pump, None)
 
     # --- STOP ---------------------------------------------------------------------------------

@@ -1,7 +1,7 @@
 """What the client tells and raises."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from robot_bridge.protocol import messages
 from robot_bridge.protocol.messages import AxisTravel, CommandState
@@ -70,6 +70,11 @@ class BridgeStatus:
     command_code: str
     command_text: str
     refused: int
+    certain_axes: tuple[str, ...] = ()
+    bound_um: Mapping[str, int] = field(default_factory=dict)
+    remembered_um: Mapping[str, int] = field(default_factory=dict)
+    correction_um: Mapping[str, int] = field(default_factory=dict)
+    motions: int = 0
 
 
 @dataclass(frozen=True)
@@ -142,4 +147,9 @@ def status_of(status: messages.Status, age_s: float) -> BridgeStatus:
         command_code=status.command_code,
         command_text=status.command_text,
         refused=status.refused,
+        certain_axes=status.certain_axes,
+        bound_um=status.bound_um,
+        remembered_um=status.remembered_um,
+        correction_um=status.correction_um,
+        motions=status.motions,
     )

@@ -10,6 +10,7 @@ The parts: `permission` (phase, arming, latched stop), `motion_in_flight`, `brid
 
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import replace
 
 from robot_bridge.daemon import rules
 from robot_bridge.daemon.bridge_journal import BridgeJournal
@@ -22,6 +23,7 @@ from robot_bridge.daemon.motor_watch import MotorWatch
 from robot_bridge.daemon.motors import Motors
 from robot_bridge.daemon.permission import Permission
 from robot_bridge.daemon.requests import Requests
+from robot_bridge.daemon.whereabouts import Whereabouts
 from robot_bridge.protocol.bridge_end import (
     BridgeEnd,
     HeartbeatReceived,
@@ -62,7 +64,8 @@ class Bridge:
         self._permission = Permission(journal.stop)
         self._motion = MotionInFlight(
             self.motors, self._journal, clock,
-            boot_id=boot_id, timeout_s=settings.motion_timeout_s, stop_for=self.stop_for,
+            boot_id=boot_id, timeout_s=settings.motion_timeout_s,
+            whereabouts=self._whereabouts(settings, journal), stop_for=self.stop_for,
         )  # fmt: skip
         self._view = BridgeView(
             settings, boot_id, self._permission, self._motion, self.motors, self._journal,
@@ -72,6 +75,14 @@ class Bridge:
             self._view, self._permission, self._motion, self.motors, self._journal, self.refused
         )
         self._journal.close_old_commands()
+        self._journal.tie_boards(self.motors.status.boards)
+
+    def _whereabouts(self, settings: BridgeSettings, journal: Journal) -> Whereabouts:
+        """An axis whose encoder kept its count through our restart stands where it reads."""
+        status, stands = self.motors.status, dict(journal.stands)
+        for axis in status.certain_axes & journal.settled.keys():
+            stands[axis] = replace(journal.settled[axis], at_um=status.readback_um[axis])
+        return Whereabouts(settings.growth, stands)
 
     # --- what others may ask ------------------------------------------------------------------
 
@@ -198,7 +209,8 @@ class Bridge:
         self._follow_motors(now_s)
 
     def _follow_motors(self, now_s: float) -> None:
-        period_s = self.settings.motion_poll_s if self.moving else IDLE_POLL_S
+        in_haste = self.moving or self.motors.status.setting_up
+        period_s = self.settings.motion_poll_s if in_haste else IDLE_POLL_S
         if not self.motors.poll_if_due(period_s):
             return
         self._motion.heed_uncertainty()
@@ -218,6 +230,7 @@ class Bridge:
             self.motors.park_again_if_due()
 
     def _stop_stray_motion(self) -> None:
+        self._motion.note_stray()
         if self.stopped:
             self.motors.stop()
         else:
@@ -233,8 +246,10 @@ class Bridge:
     def _latch(self, code: Code, text: str, *, emergency: bool = False) -> None:
         self._motion.decide_end(Ending(CommandState.STOPPED, code, text))
         stop = self._permission.latch(code, emergency=emergency)
-        if stop.emergency and (problem := self.motors.park()) is not None:
-            self._journal.note("park_failed", text=problem)
+        if stop.emergency:
+            self._motion.note_parking()
+            if (problem := self.motors.park()) is not None:
+                self._journal.note("park_failed", text=problem)
         self._journal.latch_stop(stop, text)
 
     def shut_down(self) -> None:

@@ -5,10 +5,11 @@ what has happened anyway (a stop, a note) are counted as missing instead.
 """
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 
 from robot_bridge.daemon.journal import CommandRecord, Journal, JournalError, LatchedStop
+from robot_bridge.daemon.whereabouts import Stand
 from robot_bridge.protocol.messages import Code, CommandState
 
 
@@ -35,11 +36,20 @@ class BridgeJournal:
 
     # What must be written before it holds
 
-    def begin(self, record: CommandRecord) -> None:
-        self._journal.begin(record, self._wall_clock())
+    def begin(self, record: CommandRecord, stands: Mapping[str, Stand]) -> None:
+        self._journal.begin(record, self._wall_clock(), stands)
 
-    def end(self, record: CommandRecord) -> None:
-        self._journal.end(record, self._wall_clock())
+    def end(self, record: CommandRecord, stands: Mapping[str, Stand] | None = None) -> None:
+        self._journal.end(record, self._wall_clock(), stands)
+
+    def keep_stands(self, stands: Mapping[str, Stand]) -> None:
+        self._journal.keep_stands(stands, self._wall_clock())
+
+    def tie_boards(self, boards: Mapping[str, str]) -> None:
+        """Boards that were not known yet; those that were stay what they were."""
+        new = {axis: b for axis, b in boards.items() if b and axis not in self._journal.boards}
+        if new:
+            self._journal.tie_boards(new, self._wall_clock())
 
     def refuse(self, record: CommandRecord) -> None:
         self._journal.refuse(record, self._wall_clock())

@@ -1,7 +1,9 @@
 """What a bridge is told once, when it starts."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
+from robot_bridge.daemon.whereabouts import Growth
 from robot_bridge.protocol.messages import AxisTravel
 
 
@@ -12,3 +14,4 @@ class BridgeSettings:
     motion_timeout_s: float = 60.0
     motion_poll_s: float = 0.02
     software: str = ""
+    growth: Mapping[str, Growth] = field(default_factory=dict)

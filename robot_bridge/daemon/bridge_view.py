@@ -1,7 +1,7 @@
 """How the bridge stands, for its rules and for the service. Looks, and changes nothing."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from robot_bridge.daemon import rules
@@ -10,6 +10,7 @@ from robot_bridge.daemon.bridge_settings import BridgeSettings
 from robot_bridge.daemon.motion_in_flight import MotionInFlight
 from robot_bridge.daemon.motor_watch import MotorWatch
 from robot_bridge.daemon.permission import Permission
+from robot_bridge.daemon.whereabouts import Stand
 from robot_bridge.protocol.framing import FrameCounters
 from robot_bridge.protocol.messages import PROTOCOL_VERSION, SCHEMA, Code, Hello, Message, Status
 
@@ -41,7 +42,9 @@ class BridgeView:
             stop_count=permission.stop_count,
             insertion_locked=self.journal.insertion_locked,
             in_flight=command.command_id if command else None,
-            certain=self.motion.certain,
+            certain_axes=self.motion.certain_axes,
+            readback_um=dict(self.motors.status.readback_um),
+            whereabouts=self.motion.whereabouts,
             fault=self.motors.status.fault,
             last_motion=self.motion.last_motion,
             measurement_used=self.journal.measurement_used(
@@ -76,7 +79,23 @@ class BridgeView:
             command_readback_um=dict(command.readback_um) if command else {},
             frames_bad=self.frames.bad,
             refused=self.refused.total(),
+            certain_axes=tuple(sorted(self.motion.certain_axes)),
+            bound_um={axis: stand.bound_um for axis, stand in self._stands().items()},
+            remembered_um={
+                axis: stand.true_um
+                for axis, stand in self._stands().items()
+                if axis not in self.motion.certain_axes
+            },
+            correction_um={
+                axis: stand.correction_um
+                for axis, stand in self._stands().items()
+                if axis in self.motion.certain_axes and stand.correction_um
+            },
+            motions=self.motion.motions,
         )
+
+    def _stands(self) -> Mapping[str, Stand]:
+        return self.motion.whereabouts.stands
 
     def hello(self, nonce: int, session: int) -> Hello:
         return Hello(

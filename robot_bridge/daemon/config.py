@@ -10,12 +10,14 @@ import tomllib
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from robot_bridge.protocol.messages import NAME_MAX, AxisTravel
 
 TRAVEL_MAX_MM = 1000.0
 DRIVES = ("open_loop", "closed_loop")
+HOMING_OVERTRAVEL = 1.2  # of the travel: as far as the search for a mechanical end may go
+HOMING_EXTRA_S = 5.0  # unparking, backing off, slow adapters
 
 
 class ConfigError(ValueError):
@@ -30,6 +32,12 @@ class AxisConfig:
     travel_min_um, travel_max_um: both ends allowed.
     step_um_forward, step_um_reverse: length of one wfm-step (open loop).
     counts_per_mm, tolerance_counts, encoder_type: encoder (closed loop); encoder_type is Y13.
+    step_error: how wrong the step lengths may be, as a fraction; what is not known of the position
+        of an axis without encoder grows by that much of every way that it goes.
+    serial_number: of the board that drives this axis; None: whichever answers first is remembered.
+    home_to: the mechanical end or limit switch nearest to `home_um`, or the encoder's index.
+    limit_switches (Y2: 0 none, 1 active high, 2 active low), encoder_direction (Y6): None leaves
+        what the board's flash holds. ramp_up_hz_per_ms is Y9, overshoot_model Y12.
     """
 
     name: str
@@ -48,10 +56,26 @@ class AxisConfig:
     tolerance_counts: int
     encoder_type: int
     home_um: int | None
+    step_error: float = 0.05
+    serial_number: int | None = None
+    home_to: str = "end"
+    limit_switches: int | None = None
+    encoder_direction: int | None = None
+    ramp_up_hz_per_ms: int = 20
+    overshoot_model: int = 3
+    waveform: Literal["rhomb", "delta"] = "delta"
 
     @property
     def travel(self) -> AxisTravel:
-        return AxisTravel(self.name, self.travel_min_um, self.travel_max_um)
+        return AxisTravel(self.name, self.travel_min_um, self.travel_max_um, self.tolerance_um)
+
+    @property
+    def homing_s(self) -> float:
+        """How long homing may take at the set speed: there and, for an index, back."""
+        step_um = min(self.step_um_forward, self.step_um_reverse)
+        way_um = HOMING_OVERTRAVEL * (self.travel_max_um - self.travel_min_um)
+        ways = 2.0 if self.home_to == "index" else 1.0
+        return ways * way_um / (step_um * self.speed_hz) + HOMING_EXTRA_S
 
 
 @dataclass(frozen=True)
@@ -182,7 +206,17 @@ def _axis_from_table(raw: Any, where: str) -> AxisConfig:
         tolerance_counts=table.integer("tolerance_counts", 1, 65535, default=2),
         encoder_type=table.integer("encoder_type", 0, 60, default=1),
         home_um=None if home_mm is None else round(home_mm * 1000.0),
+        step_error=float(table.number("step_error", 0.0, 1.0, default=0.05)),
+        serial_number=table.integer("serial_number", 0, 2**32 - 1, default=None),
+        home_to=table.text("home_to", default="end", among=("end", "index")),
+        limit_switches=table.integer("limit_switches", 0, 2, default=None),
+        encoder_direction=table.integer("encoder_direction", 0, 1, default=None),
+        ramp_up_hz_per_ms=table.integer("ramp_up_hz_per_ms", 1, 800, default=20),
+        overshoot_model=table.integer("overshoot_model", 0, 3, default=3),
+        waveform=table.text("waveform", default="delta", among=("rhomb", "delta")),
     )
+    if axis.home_to == "index" and not closed:
+        raise table.fail("home_to", "an axis without encoder has no index")
     table.finish()
     return axis
 
@@ -231,7 +265,18 @@ def bridge_config_from_table(table: Mapping[str, Any], where: str) -> BridgeConf
     )
     keys.finish()
     _check_axes_differ(config.axes, where)
+    _check_homing_fits(config, where)
     return config
+
+
+def _check_homing_fits(config: BridgeConfig, where: str) -> None:
+    for axis in config.axes:
+        if axis.home_um is not None and axis.homing_s > config.motion_timeout_s:
+            raise ConfigError(
+                f"{where}: bridge.motion_timeout_s: homing of {axis.name!r} may take "
+                f"{axis.homing_s:.0f} s at {axis.speed_hz} Hz, motion_timeout_s is "
+                f"{config.motion_timeout_s:g}"
+            )
 
 
 def _check_axes_differ(axes: tuple[AxisConfig, ...], where: str) -> None:

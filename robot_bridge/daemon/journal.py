@@ -14,6 +14,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+from robot_bridge.daemon.whereabouts import Stand, stand_from_entry
 from robot_bridge.protocol.messages import Code, CommandState
 
 FILE_NAME = "bridge_journal.jsonl"
@@ -36,10 +37,11 @@ class CommandRecord:
     code: str = Code.OK
     text: str = ""
     readback_um: Mapping[str, int] = field(default_factory=dict)
+    axes: tuple[str, ...] = ()  # of a homing; none: all
 
     def asks_the_same(self, other: "CommandRecord") -> bool:
-        mine = (self.what, dict(self.setpoints_um), self.measurement_id)
-        return mine == (other.what, dict(other.setpoints_um), other.measurement_id)
+        mine = (self.what, dict(self.setpoints_um), self.measurement_id, self.axes)
+        return mine == (other.what, dict(other.setpoints_um), other.measurement_id, other.axes)
 
 
 def _line(entry: Mapping[str, Any]) -> bytes:
@@ -76,6 +78,9 @@ class Journal:
         self.measurements_used: set[str] = set()
         self.insertion_locked = False
         self.stop = LatchedStop()
+        self.settled: dict[str, Stand] = {}  # as each axis stood after its last motion
+        self.stands: dict[str, Stand] = {}  # as it may stand now, if that one came to no end
+        self.boards: dict[str, str] = {}  # the serial number of the board that drives each axis
         self._sync = sync
         try:
             folder.mkdir(parents=True, exist_ok=True)
@@ -117,7 +122,7 @@ class Journal:
         if kind == "begin":
             record = CommandRecord(
                 entry["id"], entry["what"], entry["setpoints_um"], entry["measurement_id"],
-                entry["based_on_motion"],
+                entry["based_on_motion"], axes=tuple(entry.get("axes", ())),
             )  # fmt: skip
             self.commands[record.command_id] = record
             if entry["accepted"] and record.measurement_id is not None:
@@ -130,6 +135,12 @@ class Journal:
                 text=entry["text"],
                 readback_um=entry["readback_um"],
             )
+        elif kind in ("stand", "going"):
+            self.stands = {a: stand_from_entry(e) for a, e in entry["axes"].items()}
+            if kind == "stand":
+                self.settled = self.stands
+        elif kind == "boards":
+            self.boards |= entry["boards"]
         elif kind == "lock":
             self.insertion_locked = bool(entry["locked"])
         elif kind == "stop":
@@ -137,13 +148,34 @@ class Journal:
         elif kind == "rearm":
             self.stop = replace(self.stop, latched=False)
 
-    def begin(self, record: CommandRecord, wall_s: float) -> None:
-        """A command is accepted and may move from now on. Durable. Raises JournalError."""
-        self._append(_begin_entry(record, wall_s, accepted=True))
+    def begin(
+        self, record: CommandRecord, wall_s: float, stands: Mapping[str, Stand] | None = None
+    ) -> None:
+        """A command is accepted and may move from now on. Durable. Raises JournalError.
 
-    def end(self, record: CommandRecord, wall_s: float) -> None:
+        stands: what is known of the axes if nothing more is heard of it; None: as before.
+        """
+        entries = [_begin_entry(record, wall_s, accepted=True)]
+        if stands is not None:
+            entries.append(_stand_entry(stands, wall_s, "going"))
+        self._append(*entries)
+
+    def end(
+        self, record: CommandRecord, wall_s: float, stands: Mapping[str, Stand] | None = None
+    ) -> None:
         """A command that began has ended. Durable. Raises JournalError."""
-        self._append(_end_entry(record, wall_s))
+        entries = [_end_entry(record, wall_s)]
+        if stands is not None:
+            entries.append(_stand_entry(stands, wall_s))
+        self._append(*entries)
+
+    def keep_stands(self, stands: Mapping[str, Stand], wall_s: float) -> None:
+        """The axes were declared, corrected or moved otherwise. Durable. Raises JournalError."""
+        self._append(_stand_entry(stands, wall_s))
+
+    def tie_boards(self, boards: Mapping[str, str], wall_s: float) -> None:
+        """These boards drive these axes. Durable. Raises JournalError."""
+        self._append({"kind": "boards", "t": wall_s, "boards": dict(boards)})
 
     def refuse(self, record: CommandRecord, wall_s: float) -> None:
         """A command was refused and will not move, ever. Durable. Raises JournalError."""
@@ -207,6 +239,13 @@ def _begin_entry(record: CommandRecord, wall_s: float, *, accepted: bool) -> dic
         "kind": "begin", "t": wall_s, "id": record.command_id, "what": record.what,
         "setpoints_um": dict(record.setpoints_um), "measurement_id": record.measurement_id,
         "based_on_motion": record.based_on_motion, "accepted": accepted,
+        "axes": list(record.axes),
+    }  # fmt: skip
+
+
+def _stand_entry(stands: Mapping[str, Stand], wall_s: float, kind: str = "stand") -> dict[str, Any]:
+    return {
+        "kind": kind, "t": wall_s, "axes": {a: stand.as_entry() for a, stand in stands.items()},
     }  # fmt: skip
 
 

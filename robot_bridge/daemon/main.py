@@ -17,10 +17,11 @@ from pathlib import Path
 
 from robot_bridge.daemon.bridge import Bridge
 from robot_bridge.daemon.bridge_settings import BridgeSettings
-from robot_bridge.daemon.config import BridgeConfig
+from robot_bridge.daemon.config import AxisConfig, BridgeConfig
 from robot_bridge.daemon.guardian import Guardian
 from robot_bridge.daemon.journal import Journal, JournalError
 from robot_bridge.daemon.motors import MotorError, Motors
+from robot_bridge.daemon.whereabouts import RUN_SIGMAS, Growth
 from robot_bridge.protocol.messages import Code
 from robot_bridge.protocol.transport import SerialTransport, Transport, TransportError
 
@@ -178,6 +179,15 @@ class Daemon:
             "moving": status.moving,
             "positions_um": status.positions_um,
             "position_certain": status.position_certain,
+            "certain_axes": list(status.certain_axes),
+            "bound_um": status.bound_um,
+            "remembered_um": status.remembered_um,
+            "correction_um": status.correction_um,
+            "motions": status.motions,
+            "last_motion": status.last_motion,
+            "boards": dict(bridge.motors.status.boards),
+            "supply": {a: dict(s) for a, s in bridge.motors.status.supply.items()},
+            "warnings": list(bridge.motors.status.warnings),
             "fault": status.fault,
             "frames": bridge.end.counters.as_dict(),
             "refused": dict(bridge.refused),
@@ -216,6 +226,17 @@ def settings_of(config: BridgeConfig) -> BridgeSettings:
         motion_timeout_s=config.motion_timeout_s,
         motion_poll_s=config.motion_poll_s,
         software=SOFTWARE,
+        growth={axis.name: _growth_of(axis) for axis in config.axes},
+    )
+
+
+def _growth_of(axis: AxisConfig) -> Growth:
+    counted = axis.drive == "open_loop"
+    return Growth(
+        step_error=axis.step_error if counted else 0.0,
+        run_um=RUN_SIGMAS * axis.tolerance_um if counted else 0.0,
+        approach_um=axis.approach_um,
+        tolerance_um=axis.tolerance_um,
     )
 
 
@@ -291,6 +312,7 @@ def _start(
         raise StartError(f"{config.status_file}: cannot be written: {error.strerror}") from error
     motors = make_motors(config)
     try:
+        motors.know_boards(journal.boards)
         motors.open()
         return Daemon(
             config,

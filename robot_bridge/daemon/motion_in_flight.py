@@ -22,11 +22,14 @@ from robot_bridge.daemon.motion import (
 )
 from robot_bridge.daemon.motor_watch import MotorWatch
 from robot_bridge.daemon.motors import MotorError
+from robot_bridge.daemon.whereabouts import Stand, Whereabouts
 from robot_bridge.protocol.messages import TEXT_MAX, Code, CommandState
 
 
 class MotionInFlight:
-    """`last_motion` names what moved the robot last, or said where it is."""
+    """`last_motion` names what moved the robot last, or said where it is; `motions` counts what
+    moved it, or may have.
+    """
 
     def __init__(
         self,
@@ -36,6 +39,7 @@ class MotionInFlight:
         *,
         boot_id: str,
         timeout_s: float,
+        whereabouts: Whereabouts,
         stop_for: Callable[[Code, str], None],
     ) -> None:
         """`stop_for` is the bridge's: it stops and latches."""
@@ -49,8 +53,10 @@ class MotionInFlight:
         self._timeout_s = timeout_s
         self._stop_for = stop_for
         self._motion: Motion | None = None
-        self._certain = False
+        self._certain: frozenset[str] = frozenset()
         self._declared = 0
+        self.motions = 0
+        self.whereabouts = whereabouts
 
     @property
     def command(self) -> CommandRecord | None:
@@ -60,31 +66,68 @@ class MotionInFlight:
     # --- the position -------------------------------------------------------------------------
 
     @property
+    def certain_axes(self) -> frozenset[str]:
+        return self._certain & self._motors.status.certain_axes
+
+    @property
     def certain(self) -> bool:
-        return self._certain and self._motors.status.certain
+        """Every axis."""
+        return self.certain_axes >= self._motors.status.readback_um.keys()
 
     def heed_uncertainty(self) -> None:
-        """What was lost stays lost until homing or a declaration, whatever the motors say later.
-        While they home they may well be uncertain.
-        """
-        homing = self._motion is not None and self._motion.homing
-        if not self._motors.status.certain and not homing:
-            self._certain = False
+        """What was lost stays lost until homing or a declaration, whatever the motors say later."""
+        lost = self._certain - self._motors.status.certain_axes
+        if not lost:
+            return
+        self._certain -= lost
+        if self._motion is None:
+            self._moved_otherwise(f"lost:{self._boot_id}")
 
-    def declare_position(self, positions_um: Mapping[str, int]) -> None:
-        """Raises MotorError."""
+    def _moved_otherwise(self, what: str) -> None:
+        self.motions += 1
+        self.last_motion = f"{what}:{self.motions}"
+
+    def note_parking(self) -> None:
+        """Parking may shift an axis a little."""
+        self._moved_otherwise(f"parked:{self._boot_id}")
+
+    def note_stray(self) -> None:
+        """An axis moved, or moves, without a command."""
+        self._moved_otherwise(f"stray:{self._boot_id}")
+
+    def declare_position(
+        self, positions_um: Mapping[str, int], within_um: Mapping[str, int]
+    ) -> None:
+        """Only what is named is declared. Raises MotorError, JournalError."""
         self._motors.motors.declare_position(positions_um)
-        self._certain = True
+        self._certain |= frozenset(positions_um)
         self._declared += 1
         self.last_motion = f"declared:{self._boot_id}:{self._declared}"
+        self.whereabouts.declared(positions_um, within_um)
         self._motors.poll()
+        self._journal.keep_stands(self.whereabouts.stands)
+
+    def correct_position(
+        self, correction_um: Mapping[str, int], within_um: Mapping[str, int]
+    ) -> None:
+        """Raises JournalError."""
+        self.whereabouts.corrected(correction_um, within_um)
+        self._journal.keep_stands(self.whereabouts.stands)
 
     # --- begin --------------------------------------------------------------------------------
 
     def accept(self, record: CommandRecord) -> None:
-        """It is journalled; the motors begin in the next `begin_if_due`."""
+        """Journal it; the motors begin in the next `begin_if_due`. Raises JournalError."""
+        self._journal.begin(record, self._if_nothing_more_is_heard(record))
         self._motion = Motion(record, self._clock())
         self.last_command = record
+
+    def _if_nothing_more_is_heard(self, record: CommandRecord) -> dict[str, Stand]:
+        stands = dict(self.whereabouts.stands)
+        if record.what == "home":
+            axes = record.axes or stands.keys()
+            return {axis: stand for axis, stand in stands.items() if axis not in axes}
+        return stands | self.whereabouts.going(record.setpoints_um)
 
     def begin_if_due(self) -> None:
         motion = self._motion
@@ -97,10 +140,12 @@ class MotionInFlight:
         motion.record = replace(motion.record, state=CommandState.RUNNING)
         self.last_command = motion.record
         self.last_motion = motion.record.command_id
+        self.motions += 1
         self._motors.begun()
         try:
             if motion.homing:
-                self._motors.motors.home()
+                self._certain -= self._homed_axes(motion.record)
+                self._motors.motors.home(motion.record.axes)
             else:
                 self._motors.motors.move_to(motion.record.setpoints_um)
         except MotorError as error:
@@ -140,6 +185,27 @@ class MotionInFlight:
         if self._motion is not None:
             self._motion.decide_end(ending, self._clock())
 
+    def _homed_axes(self, record: CommandRecord) -> frozenset[str]:
+        return frozenset(record.axes or self._motors.status.readback_um)
+
+    def _know_afterwards(self, motion: Motion, ending: Ending) -> None:
+        """Where the axes stand now: where they read if they are certain, else somewhere between."""
+        readback_um = self._motors.status.readback_um
+        if motion.homing:
+            homed = self._homed_axes(motion.record)
+            self.whereabouts.forget(homed)
+            if ending.state is CommandState.DONE:
+                self._certain |= homed & self._motors.status.certain_axes
+                self.whereabouts.homed({axis: readback_um[axis] for axis in homed})
+            return
+        if not motion.started:
+            return
+        going = self.whereabouts.going(motion.record.setpoints_um)
+        self.whereabouts.arrived(readback_um, self.certain_axes)
+        for axis, stand in going.items():
+            if axis not in self.certain_axes:
+                self.whereabouts.stands[axis] = stand
+
     def _finish(self, ending: Ending) -> None:
         assert self._motion is not None
         motion, self._motion = self._motion, None
@@ -150,10 +216,9 @@ class MotionInFlight:
             text=ending.text[:TEXT_MAX],
             readback_um=dict(self._motors.status.readback_um),
         )
-        if ending.state is CommandState.DONE and motion.homing:
-            self._certain = True
+        self._know_afterwards(motion, ending)
         try:
-            self._journal.end(record)
+            self._journal.end(record, self.whereabouts.stands)
         except JournalError as error:
             # After a restart the journal would say FAILED; so it has failed, now and then.
             record = replace(

@@ -33,7 +33,7 @@ class MotorWatch:
             self.status = self.motors.poll()
         except MotorError as error:  # the driver's promise is broken; believe the worst
             self.status = replace(
-                self.status, certain=False, fault=error.code, fault_text=error.text
+                self.status, certain_axes=frozenset(), fault=error.code, fault_text=error.text
             )
 
     def begun(self) -> None:

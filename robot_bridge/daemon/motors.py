@@ -5,7 +5,7 @@ included: `poll` returns within POLL_BOUND_S and `stop` within STOP_BOUND_S, bec
 calls them also listens for STOP.
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -29,33 +29,51 @@ class MotorStatus:
     moving: a motion begun by `move_to` or `home` has not ended (legs of one motion count as one).
     reached: the last motion ended at its setpoints within the driver's tolerance.
     readback_um: by axis; for an open-loop axis the position that the step count implies.
-    certain: false from power-up, controller reset, stall or an unexpected motion until `home` or
-        `declare_position`.
+    certain_axes: an axis is not among them from power-up, controller reset, stall or an unexpected
+        motion until its own `home` or `declare_position`; its readback says nothing then.
     fault: a short code while something is wrong (a fault ends the motion), else None.
+    boards: the serial number of each axis's controller, "" if it tells none.
+    setting_up: controllers are being initialised (again); poll as often as during a motion.
+    supply: by axis what the controller measures of itself: volts and degrees Celsius.
     """
 
     moving: bool
     reached: bool
     readback_um: Mapping[str, int]
-    certain: bool
+    certain_axes: frozenset[str]
     parked: bool = False
     fault: str | None = None
     fault_text: str = ""
-    warnings: tuple[str, ...] = field(default=())
+    warnings: tuple[str, ...] = ()
+    setting_up: bool = False
+    boards: Mapping[str, str] = field(default_factory=dict)
+    supply: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
+
+    @property
+    def certain(self) -> bool:
+        """Every axis."""
+        return self.certain_axes >= self.readback_um.keys()
 
 
 class Motors(Protocol):
+    def know_boards(self, boards: Mapping[str, str]) -> None:
+        """The boards that drove the axes before, by serial number: another one is an error."""
+
     def open(self) -> MotorStatus:
         """Connect, identify and initialise the controllers; nothing moves. Raises MotorError."""
 
     def move_to(self, setpoints_um: Mapping[str, int]) -> None:
         """Begin one motion of the named axes to absolute setpoints (unparks if needed).
 
+        An axis that stands where it is asked to be, within its tolerance, is not commanded.
         Raises MotorError, and then nothing moves. Never called while `poll` says moving.
         """
 
-    def home(self) -> None:
-        """Begin the search for the reference; progress by `poll`. Raises MotorError."""
+    def home(self, axes: Collection[str] = ()) -> None:
+        """Begin the search for the reference of these axes (none named: all); progress by `poll`.
+
+        Raises MotorError.
+        """
 
     def poll(self) -> MotorStatus:
         """Advance and read. Called about every 20 ms during a motion, every 200 ms otherwise.
@@ -73,7 +91,7 @@ class Motors(Protocol):
         """Take the power off; the motors hold by friction. Progress by `poll`: `parked`."""
 
     def declare_position(self, positions_um: Mapping[str, int]) -> None:
-        """The axes stand at these positions (measured otherwise). Raises MotorError."""
+        """The named axes, and no others, stand at these positions. Raises MotorError."""
 
     def close(self) -> None:
         """Release the ports. Idempotent; stops nothing by itself."""

@@ -23,6 +23,7 @@ from robot_bridge.protocol.messages import (
     Arm,
     Code,
     CommandState,
+    CorrectPosition,
     DeclarePosition,
     Disarm,
     Home,
@@ -95,8 +96,11 @@ class Requests:
         self.journal.lock(request.locked, request.by)
 
     def _declare(self, request: DeclarePosition) -> None:
-        self.motion.declare_position(request.positions_um)
+        self.motion.declare_position(request.positions_um, request.within_um)
         self.journal.note("declare", positions_um=request.positions_um, by=request.by)
+
+    def _correct(self, request: CorrectPosition) -> None:
+        self.motion.correct_position(request.correction_um, request.within_um)
 
     # --- commands -----------------------------------------------------------------------------
 
@@ -109,10 +113,9 @@ class Requests:
         try:
             if broken is not None:
                 return self._refuse_command(record, *broken)
-            self.journal.begin(record)
+            self.motion.accept(record)
         except JournalError as error:
             return replace(self.refuse(Code.JOURNAL, str(error)), state=CommandState.REFUSED.value)
-        self.motion.accept(record)
         return _answer_of(record)
 
     def _answer_known(self, record: CommandRecord, known: CommandRecord) -> Answer:
@@ -138,12 +141,13 @@ _DO: dict[type[Message], Callable] = {
     SetPhase: Requests._set_phase,
     SetInsertionLock: Requests._set_lock,
     DeclarePosition: Requests._declare,
+    CorrectPosition: Requests._correct,
 }
 
 
 def _record_of(request: Move | Home) -> CommandRecord:
     if isinstance(request, Home):
-        return CommandRecord(request.command_id, "home", {}, None, "")
+        return CommandRecord(request.command_id, "home", {}, None, "", axes=request.axes)
     return CommandRecord(
         request.command_id,
         "move",

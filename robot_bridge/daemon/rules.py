@@ -4,16 +4,18 @@
 pass still goes through the driver's own checks.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from robot_bridge.daemon.travel import check_setpoints
+from robot_bridge.daemon.whereabouts import Whereabouts
 from robot_bridge.protocol.messages import (
     NAME_MAX,
     Arm,
     AxisTravel,
     Code,
+    CorrectPosition,
     DeclarePosition,
     Disarm,
     Home,
@@ -37,7 +39,9 @@ class Standing:
     stop_count: int
     insertion_locked: bool
     in_flight: str | None
-    certain: bool
+    certain_axes: frozenset[str]
+    readback_um: Mapping[str, int]
+    whereabouts: Whereabouts
     fault: str | None
     last_motion: str
     measurement_used: bool
@@ -159,18 +163,77 @@ def _phase_not_reachable(standing: Standing, request: Message) -> Refusal | None
 
 def _beyond_travel(standing: Standing, request: Message) -> Refusal | None:
     assert isinstance(request, Move)
-    return check_setpoints(request.setpoints_um, standing.axes)
+    return check_setpoints(request.setpoints_um, standing.axes, standing.readback_um)
 
 
 def _declared_beyond_travel(standing: Standing, request: Message) -> Refusal | None:
     assert isinstance(request, DeclarePosition)
-    return check_setpoints(request.positions_um, standing.axes)
+    named = [axis for axis in standing.axes if axis.name in request.positions_um]
+    if not named and not request.positions_um:
+        return Code.MALFORMED, "the declaration names no axis"
+    return check_setpoints(request.positions_um, named) or _bad_bounds(request.within_um, standing)
+
+
+def _bad_bounds(within_um: Mapping[str, int], standing: Standing) -> Refusal | None:
+    known = {axis.name for axis in standing.axes}
+    for axis, bound_um in within_um.items():
+        if axis not in known:
+            return Code.UNKNOWN_AXIS, f"axis {axis[:40]!r} is not one of {', '.join(sorted(known))}"
+        if bound_um < 0:
+            return Code.MALFORMED, f"axis {axis!r}: known to within {bound_um} um"
+    return None
+
+
+def _bad_correction(standing: Standing, request: Message) -> Refusal | None:
+    assert isinstance(request, CorrectPosition)
+    if request.correction_um.keys() != request.within_um.keys() or not request.correction_um:
+        return Code.MALFORMED, "every correction needs its own bound, and no other"
+    if request.based_on_motion != standing.last_motion:
+        return Code.OUTDATED_MEASUREMENT, "the robot has moved since that was seen"
+    return _bad_bounds(request.within_um, standing)
+
+
+def _no_such_axis(standing: Standing, request: Message) -> Refusal | None:
+    assert isinstance(request, Home)
+    known = {axis.name for axis in standing.axes}
+    for axis in request.axes:
+        if axis not in known:
+            return Code.UNKNOWN_AXIS, f"axis {axis[:40]!r} is not one of {', '.join(sorted(known))}"
+    return None
+
+
+def _moved_axes(standing: Standing, request: Move) -> list[AxisTravel]:
+    """Those that do not stand already where they are asked to be."""
+    return [
+        axis
+        for axis in standing.axes
+        if abs(request.setpoints_um[axis.name] - standing.readback_um[axis.name])
+        > axis.tolerance_um
+    ]
 
 
 def _uncertain(standing: Standing, request: Message) -> Refusal | None:
-    if standing.certain:
-        return None
-    return Code.POSITION_UNCERTAIN, "the position is uncertain: home or declare it first"
+    assert isinstance(request, Move)
+    for axis in _moved_axes(standing, request):
+        if axis.name not in standing.certain_axes:
+            return Code.POSITION_UNCERTAIN, (
+                f"the position of axis {axis.name!r} is uncertain: home or declare it first"
+            )
+    return None
+
+
+def _too_little_known(standing: Standing, request: Message) -> Refusal | None:
+    assert isinstance(request, Move)
+    for axis in _moved_axes(standing, request):
+        setpoint_um = request.setpoints_um[axis.name]
+        low_um, high_um = standing.whereabouts.reach_um(axis.name, setpoint_um)
+        if not (axis.min_um <= low_um and high_um <= axis.max_um):
+            return Code.BEYOND_TRAVEL, (
+                f"axis {axis.name!r}: sent to {setpoint_um} um it could stand anywhere from "
+                f"{low_um:.0f} to {high_um:.0f} um, its travel is {axis.min_um} to {axis.max_um} "
+                "um: look where it is, home or declare it first"
+            )
+    return None
 
 
 def _outdated(standing: Standing, request: Message) -> Refusal | None:
@@ -205,7 +268,15 @@ _RULES: dict[type[Message], tuple[Rule, ...]] = {
     Disarm: (),
     SetPhase: (_nobody, _stale, _stop_latched, _in_flight, _phase_not_reachable),
     SetInsertionLock: (_nobody, _stale_unlock),
-    Move: (*_MAY_MOVE, _phase_forbids_move, _beyond_travel, _uncertain, _outdated),
-    Home: (*_MAY_MOVE, _nobody, _phase_forbids_home),
+    Move: (
+        *_MAY_MOVE,
+        _phase_forbids_move,
+        _beyond_travel,
+        _uncertain,
+        _too_little_known,
+        _outdated,
+    ),
+    Home: (*_MAY_MOVE, _nobody, _phase_forbids_home, _no_such_axis),
     DeclarePosition: (_nobody, _stale, _in_flight, _declared_beyond_travel),
+    CorrectPosition: (_stale, _in_flight, _bad_correction),
 }

@@ -6,9 +6,15 @@ from robot_bridge.protocol.messages import AxisTravel, Code
 
 
 def check_setpoints(
-    setpoints_um: Mapping[str, object], axes: Sequence[AxisTravel]
+    setpoints_um: Mapping[str, object],
+    axes: Sequence[AxisTravel],
+    readback_um: Mapping[str, int] | None = None,
 ) -> tuple[Code, str] | None:
-    """What is wrong with `setpoints_um`, or None: all axes, no other, whole µm, inside travel."""
+    """What is wrong with `setpoints_um`, or None: all axes, no other, whole um, inside travel.
+
+    An axis that stands a little beyond its travel, within its tolerance, may be asked to stay: it
+    must not keep the others from moving. readback_um: where the axes stand; None: as asked.
+    """
     names = [axis.name for axis in axes]
     for name in setpoints_um:
         if name not in names:
@@ -19,7 +25,9 @@ def check_setpoints(
         value = setpoints_um[axis.name]
         if type(value) is not int:
             return Code.MALFORMED, f"axis {axis.name!r}: {str(value)[:40]} is not a whole number"
-        if not axis.min_um <= value <= axis.max_um:
+        stays = readback_um is None or abs(value - readback_um[axis.name]) <= axis.tolerance_um
+        spare_um = axis.tolerance_um if stays else 0
+        if not axis.min_um - spare_um <= value <= axis.max_um + spare_um:
             return Code.BEYOND_TRAVEL, (
                 f"axis {axis.name!r}: {value} um is outside its travel "
                 f"{axis.min_um} to {axis.max_um} um"

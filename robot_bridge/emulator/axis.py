@@ -35,6 +35,9 @@ class Motor:
     um_per_count: float = 0.1
     encoder_reversed: bool = False
     index_um: float | None = None
+    # where the stage presses its switches, reverse and forward, in the motor's forward direction
+    switches_um: tuple[float, float] | None = None
+    mounting: int = 1  # -1: the stage's position shrinks when the motor runs forward
 
     @property
     def max_frequency_hz(self) -> int:
@@ -142,6 +145,7 @@ class EmulatedController:
     def begin_target(self, target_count: int, speed_hz: float) -> None:
         self._begin("target")
         self.last_target = target_count
+        self.reverse = target_count < self.count
         self.run = TargetRun(target_count, self.count, speed_hz)
 
     def _begin(self, cause: str) -> None:
@@ -200,7 +204,34 @@ class EmulatedController:
             self.latched |= Status.ENCODER_ERROR
         if self.powerless and self.run is not None:
             self.stop()
-        if self.faults.limit_switch and self.moving and self.settings[y.EXTERNAL_LIMIT]:
+        self._heed_limits()
+
+    @property
+    def limits(self) -> tuple[bool, bool]:
+        """Whether the reverse and the forward limit switch are pressed, or seem to be."""
+        reverse = self.faults.limit_switch or self.faults.limit_reverse
+        forward = self.faults.limit_switch or self.faults.limit_forward
+        if self.motor.switches_um is not None and not self.faults.limits_dead:
+            at_um = self.motor.mounting * self.physics.position_um
+            reverse = reverse or at_um <= self.motor.switches_um[0]
+            forward = forward or at_um >= self.motor.switches_um[1]
+        return reverse, forward
+
+    @property
+    def inputs(self) -> int:
+        """in3..in0 as four bits; in1 is limit reverse, in2 limit forward."""
+        wiring = self.settings[y.EXTERNAL_LIMIT]
+        if not wiring:
+            return 0xC
+        reverse, forward = (pressed is (wiring == 1) for pressed in self.limits)
+        return 0x8 | forward << 2 | reverse << 1
+
+    def _heed_limits(self) -> None:
+        """Each switch stops motion in its own direction, so that it can be left again."""
+        if not (self.moving and self.settings[y.EXTERNAL_LIMIT]):
+            return
+        reverse, forward = self.limits
+        if (reverse and self.reverse) or (forward and not self.reverse):
             self.stop()
             self.external_limit_at_ms = self.time_ms
 
@@ -217,6 +248,7 @@ class EmulatedController:
     def _open_tick(self, run: OpenRun, tick_s: float) -> None:
         microsteps = run.advance(self.clamp_speed(run.frequency_hz), tick_s)
         self._drive(microsteps, run.frequency_hz)
+        self._heed_limits()
         if run.remaining == 0 and self.run is run:
             self.run = None
             if run.script:
@@ -237,6 +269,7 @@ class EmulatedController:
         ceiling_hz = self.clamp_speed(run.speed_hz)
         microsteps = run.regulate(error, self.settings, ceiling_hz, tick_s)
         self._drive(microsteps, run.frequency_hz)
+        self._heed_limits()
 
     def _script_turn(self, run: OpenRun) -> None:
         """The auto-setup script: forward, then back, then direction and gain from the counts."""

@@ -40,7 +40,7 @@ def _status_word(c: EmulatedController) -> str:
 
 def _io_word(c: EmulatedController) -> str:
     fan = 8 if c.faults.overheat else 0
-    return _cased(c, f"{fan | c.outputs:x}{0xC | int(c.faults.limit_switch):x}")
+    return _cased(c, f"{fan | c.outputs:x}{c.inputs:x}")
 
 
 def _supply(c: EmulatedController) -> str:
@@ -59,7 +59,7 @@ def _drive_limits(c: EmulatedController) -> str:
 
 def digital(c: EmulatedController, args: list[int]) -> str | None:
     if not args:
-        return f"{c.outputs:03b},110{int(c.faults.limit_switch)}"
+        return f"{c.outputs:03b},{c.inputs:04b}"
     outputs = 3 if c.motor.model == "PMD401" else 2
     if len(args) != 2 or not 0 <= args[0] < outputs or args[1] not in (0, 1):
         raise NotPossibleError

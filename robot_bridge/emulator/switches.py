@@ -38,7 +38,10 @@ class AxisFaults:
     encoder_frozen: bool = False
     encoder_error: bool = False
     stalled: bool = False  # the waveform runs, the rod stands
-    limit_switch: bool = False  # the external limit input is active
+    limit_switch: bool = False  # both limit inputs are active: a broken common wire
+    limit_forward: bool = False  # in2 is active
+    limit_reverse: bool = False  # in1 is active
+    limits_dead: bool = False  # the switches say nothing, wherever the stage is
     dead: bool = False  # no answer and no motion at all
 
 

@@ -90,12 +90,27 @@ def _status_fields(status: BridgeStatus) -> dict[str, object]:
         "insertion_locked": status.insertion_locked,
         "moving": status.moving,
         "parked": status.parked,
-        "positions_um": dict(status.positions_um),
+        "positions_um": _positions(status),
         "position_certain": status.position_certain,
         "fault": status.fault,
         "last_command": status.command_id,
         "last_command_state": status.command_state.value if status.command_state else None,
     }
+
+
+def _positions(status: BridgeStatus) -> dict[str, object]:
+    """What is not known is not shown as a number."""
+    shown: dict[str, object] = {}
+    for axis, at_um in status.positions_um.items():
+        if axis in status.certain_axes:
+            shown[axis] = at_um
+        elif axis in status.remembered_um:
+            shown[axis] = (
+                f"unknown, taken for {status.remembered_um[axis]} +- {status.bound_um[axis]}"
+            )
+        else:
+            shown[axis] = "unknown"
+    return shown
 
 
 # --- moving -----------------------------------------------------------------------------------
@@ -117,8 +132,12 @@ def jog(args: argparse.Namespace, config: BridgeConfig) -> None:
 
 def home(args: argparse.Namespace, config: BridgeConfig) -> None:
     with connected(args, config) as client:
-        confirm(args, "drive every axis against its reference stop")
-        outcome = _while_armed(args, client, lambda: client.home(_command_id("home"), args.by))
+        for name in args.axes:
+            axis_named(config, name)
+        confirm(args, f"drive {', '.join(args.axes) or 'every axis'} to the end of its travel")
+        outcome = _while_armed(
+            args, client, lambda: client.home(_command_id("home"), args.by, args.axes)
+        )
     _report(args, outcome)
 
 
@@ -221,14 +240,18 @@ def declare(args: argparse.Namespace, config: BridgeConfig) -> None:
 
 
 def _declare(client: BridgeClient, texts: Sequence[str], by: str) -> None:
-    """Texts like "xt=1.5"; axes that are not named stand where they say."""
-    positions_um = dict(client.status.positions_um)
+    """Texts like "xt=1.5" or, to within a tenth of a millimetre, "xt=1.5+-0.1"; nothing else."""
+    positions_um, within_um = {}, {}
     for text in texts:
         axis, _, mm = text.partition("=")
-        if axis not in positions_um:
-            raise UsageError(f"{text!r}: {axis!r} is not one of {', '.join(positions_um)}")
-        positions_um[axis] = _um_from_text(text, mm)
-    client.declare_position(positions_um, by)
+        if axis not in client.status.positions_um:
+            known = ", ".join(client.status.positions_um)
+            raise UsageError(f"{text!r}: {axis!r} is not one of {known}")
+        at_mm, _, within_mm = mm.partition("+-")
+        positions_um[axis] = _um_from_text(text, at_mm)
+        if within_mm:
+            within_um[axis] = abs(_um_from_text(text, within_mm))
+    client.declare_position(positions_um, by, within_um)
 
 
 def _um_from_text(text: str, mm: str) -> int:

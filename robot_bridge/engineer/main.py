@@ -48,7 +48,10 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--by", default=_user(), help="who does this (default: the user)")
     parser.add_argument("--yes", action="store_true", help="move without asking")
     parser.add_argument(
-        "--at", action="append", metavar="AXIS=MM", help="first declare that an axis stands here"
+        "--at",
+        action="append",
+        metavar="AXIS=MM[+-MM]",
+        help="first declare that an axis stands here",
     )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--timeout", type=float, default=8.0, help="seconds to find the bridge")
@@ -66,9 +69,11 @@ def _add_commands(commands: _Commands) -> None:
     add.add_argument("--emergency", action="store_true", help="also park the drives")
     add.set_defaults(do=stop)
     commands.add_parser("rearm", help="clear a latched stop").set_defaults(do=rearm)
-    commands.add_parser("home", help="find the reference of every axis").set_defaults(do=home)
+    add = commands.add_parser("home", help="find the reference of these axes, or of all")
+    add.add_argument("axes", nargs="*", metavar="AXIS")
+    add.set_defaults(do=home)
     add = commands.add_parser("declare", help="say where the robot stands")
-    add.add_argument("positions", nargs="+", metavar="AXIS=MM")
+    add.add_argument("positions", nargs="+", metavar="AXIS=MM[+-MM]")
     add.set_defaults(do=declare)
     add = commands.add_parser("calibrate-steps", help="measure the step length of one axis")
     add.add_argument("axis")

@@ -1,8 +1,9 @@
-"""One motor on a PMD401/PMD301: its motions, as procedures (see pmd_line).
+"""One motor on a PMD401/PMD301: its motions, as procedures (see pmd.line).
 
 Closed loop: absolute targets in encoder counts (`T`), which may be sent twice. Open loop: relative
 runs in microsteps (`J`), which may not; the position is then what the host has counted. After
 every motion the controller is told to leave target mode, so that nothing regulates during imaging.
+An axis that stands where it is asked to be is not commanded at all.
 """
 
 import time
@@ -14,11 +15,8 @@ from robot_bridge.pmd import protocol as pmd_protocol
 from robot_bridge.pmd import units as pmd_units
 from robot_bridge.pmd.controller import (
     DECLARED_MARK,
-    MARK,
-    MIN_SPEED_HZ,
     POLL_PAUSE_S,
     POWER_ON_DELAY_US,
-    AxisFaultError,
     PmdController,
     Steps,
 )
@@ -26,16 +24,35 @@ from robot_bridge.pmd.line import Pause, Procedure
 from robot_bridge.pmd.protocol import (
     MICROSTEPS_PER_STEP,
     Command,
+    PmdNoValueError,
     PmdRefusedError,
     PmdReplyError,
     PmdTimeoutError,
 )
+from robot_bridge.pmd.setup import MIN_SPEED_HZ, initialise, verify
 from robot_bridge.pmd.status import ERRORS, Status
 
 # The controller's state settles some milliseconds after a command (25 ms in public drivers).
 SETTLE_S = 0.025
 STALL_WINDOW_S = 0.5
 RUNAWAY_MARGIN_UM = 100.0
+# Before its first long way an encoder has to follow a short run in open loop.
+PROOF_UM, PROOF_FROM_UM = 200.0, 400.0
+# Of the way that the steps should make: load and frequency change a step by a quarter, and a wrong
+# scale is most often one of two.
+FOLLOWS = 0.6
+
+
+def agrees(moved_um: float, distance_um: float) -> bool:
+    """Whether an encoder's way fits the way that the motor's steps should have made."""
+    return FOLLOWS < moved_um / distance_um < 1 / FOLLOWS
+
+
+def disagreement(moved_um: float, distance_um: float) -> str:
+    return (
+        f"the motor went {distance_um:+.0f} um by its steps and the encoder {moved_um:+.0f} um: "
+        "encoder, its direction, counts_per_mm or the step lengths are wrong"
+    )
 
 
 @dataclass
@@ -50,6 +67,9 @@ class _Run:
     @property
     def duration_s(self) -> float:
         return abs(self.microsteps) / MICROSTEPS_PER_STEP / self.speed_hz
+
+
+_ARRIVED = Status.TARGET_MODE | Status.TARGET_REACHED
 
 
 class PmdAxis(PmdController):
@@ -75,58 +95,110 @@ class PmdAxis(PmdController):
 
     # Moving
 
+    def stands_at(self, setpoint_um: float) -> bool:
+        return abs(self.position_um - setpoint_um) <= self.config.tolerance_um
+
+    def set_up(self) -> Procedure:
+        """Raises PmdError; afterwards the settings are ours. Nothing moves."""
+        yield from initialise(self)
+
     def move(self, setpoint_um: int, park_afterwards: bool) -> Procedure:
         self.fault = None
         try:
+            yield from self.read_status()
+            yield from self.check_status()
+            yield from self.read_position()
+            self.check_rest()
+            if self.stands_at(setpoint_um):
+                return
+            yield from verify(self)
             yield from self.unpark()
-            yield from self._read_position()
-            self._check_rest()
+            yield from self.read_position()
+            self.check_rest()
+            yield from self._prove(setpoint_um)
             for leg_um in pmd_units.legs_um(self.config, self.position_um, setpoint_um):
                 if self.closed_loop:
                     yield from self._closed_leg(leg_um)
                 else:
                     yield from self._open_leg(leg_um)
-            self._at_rest_um = self.position_um
+            self.at_rest_um = self.position_um
             if park_afterwards:
                 yield from self.park()
         except PmdRefusedError as error:
             raise self.error("refused", str(error)) from error
 
+    def _prove(self, setpoint_um: int) -> Steps[None]:
+        """The encoder has to follow the motor once, before it is believed over a long way."""
+        distance_um = setpoint_um - self.position_um
+        if self.proven or not self.closed_loop or abs(distance_um) < PROOF_FROM_UM:
+            return
+        from_um = self.position_um
+        run_um = PROOF_UM if distance_um > 0 else -PROOF_UM
+        yield from self.run_open_loop(pmd_units.microsteps_from_um(self.config, run_um))
+        yield from self.read_position_surely()
+        self.at_rest_um = self.position_um
+        moved_um = self.position_um - from_um
+        if abs(run_um) > 4 * self.jitter_um and not agrees(moved_um, run_um):
+            self.certain = False
+            raise self.error("encoder_disagrees", disagreement(moved_um, run_um))
+        self.proven = True
+
     def _check_moving(self) -> Steps[None]:
         """The limit bit tells of the last motion, so it is only looked at while ours lasts."""
-        yield from self._check_status()
+        yield from self.check_status()
         if self.status & Status.EXTERNAL_LIMIT:
             raise self.error("external_limit", "a limit switch stopped the motor")
 
+    def _go(self, command: Command) -> Steps[None]:
+        """A motion in two steps where the board can do it: what was damaged is never run."""
+        if not self.can_store:
+            yield command
+            return
+        yield pmd_protocol.store(command)
+        yield pmd_protocol.run_stored(command)
+
+    def _forget_stored(self) -> Steps[None]:
+        if self.can_store:
+            yield pmd_protocol.overwrite_stored(self.address)
+
     def _closed_leg(self, setpoint_um: int) -> Steps[None]:
-        self._at_rest_um = None
+        self.at_rest_um = None
         target = pmd_units.count_from_um(self.config, setpoint_um)
-        go = pmd_protocol.move_to_count(self.address, target, self.speed_hz)
-        yield pmd_protocol.store(go)
-        yield pmd_protocol.run_stored(go)
+        try:
+            yield from self._go(pmd_protocol.move_to_count(self.address, target, self.speed_hz))
+        except PmdNoValueError:  # no echo: what it does is seen below, and a target is absolute
+            self.doubts["T"] = "a motion is not confirmed by an echo"
         told_near = False
         watch = _ProgressWatch(self, abs(setpoint_um - self.position_um), self._clock())
         while True:
             yield Pause(POLL_PAUSE_S)
-            status = yield from self._read_status()
-            yield from self._read_position()
+            status = yield from self.read_status()
+            yield from self.read_position()
             yield from self._check_moving()
             error_um = abs(self.position_um - setpoint_um)
-            arrived = Status.TARGET_MODE | Status.TARGET_REACHED
-            if status & arrived == arrived:
+            if status & _ARRIVED == _ARRIVED:
                 # Merely near is believed when it is told twice: the line has no checksum.
                 near = error_um <= self.config.tolerance_um
-                if error_um <= self._jitter_um or (near and told_near):
+                if error_um <= self.jitter_um or (near and told_near):
                     break
                 told_near = near
             if status & Status.TARGET_LIMIT:
                 raise self.error("target_limit", f"stopped at a limit, {error_um:.0f} um short")
-            if not status & Status.TARGET_MODE:
+            if not status & (Status.TARGET_MODE | Status.RUNNING):
+                if "T" in self.doubts and error_um <= self.jitter_um:
+                    break  # a board that knows no target mode
                 raise self.error("stopped", f"left target mode {error_um:.0f} um short")
             watch.check(error_um, self._clock())
-        yield pmd_protocol.stop(self.address)
-        yield pmd_protocol.overwrite_stored(self.address)
-        yield from self._read_position_surely()
+        yield from self._leave_target_mode()
+        yield from self._forget_stored()
+        yield from self.read_position_surely()
+
+    def _leave_target_mode(self) -> Steps[None]:
+        try:
+            yield pmd_protocol.stop(self.address)
+        except PmdNoValueError:
+            if "S" not in self.doubts:
+                raise
 
     def _open_leg(self, setpoint_um: float) -> Steps[None]:
         microsteps = pmd_units.microsteps_from_um(self.config, setpoint_um - self.position_um)
@@ -136,53 +208,62 @@ class PmdAxis(PmdController):
 
     def run_open_loop(self, microsteps: int) -> Steps[None]:
         """One relative run, counted by the host. If it cannot be accounted for, say uncertain."""
+        go = pmd_protocol.run_microsteps(self.address, microsteps, self.speed_hz)
+        yield from self._run_counted(go, microsteps)
+
+    def run_to_index(self, microsteps: int) -> Steps[None]:
+        """Until the index is passed, or the run ends; it may end anywhere."""
+        go = pmd_protocol.run_to_index(self.address, microsteps, self.speed_hz)
+        yield from self._run_counted(go, microsteps, anywhere=True)
+
+    def _run_counted(self, go: Command, microsteps: int, *, anywhere: bool = False) -> Steps[None]:
         phase = yield from self._microstep_phase()
-        expected_phase = (phase + microsteps) % MICROSTEPS_PER_STEP
+        expected = None if phase is None else (phase + microsteps) % MICROSTEPS_PER_STEP
         run = _Run(self.position_um, microsteps, self.speed_hz, self._clock())
         self._run = run
+        self.at_rest_um = None
         try:
-            yield from self._begin_run(run, phase, expected_phase)
+            yield from self._begin_run(go, phase, expected)
             yield from self._await_run_end(run)
             ended_at = yield from self._microstep_phase()
-            if ended_at != expected_phase:
+            if ended_at != expected and not anywhere:
                 raise self.error(
-                    "run_incomplete",
-                    f"microstep counter reads {ended_at}, expected {expected_phase}",
+                    "run_incomplete", f"microstep counter reads {ended_at}, expected {expected}"
                 )
             self.position_um = run.from_um + pmd_units.um_from_microsteps(self.config, microsteps)
             self._run = None
-            yield pmd_protocol.overwrite_stored(self.address)
+            yield from self._forget_stored()
         finally:
             if self._run is not None:  # stopped, failed or given up
-                self.position_um = self._estimate_um(run)
-                self.certain = False
+                if not self.closed_loop:
+                    self.position_um = self._estimate_um(run)
+                    self.certain = False
                 self._run = None
 
     def run_steps(self, steps: int) -> Procedure:
         """A run of whole waveform steps whatever they amount to; the encoder, if any, tells."""
         self.fault = None
+        yield from verify(self)
         yield from self.unpark()
         yield from self.run_open_loop(steps * MICROSTEPS_PER_STEP)
-        yield from self._read_position()
-        self._at_rest_um = self.position_um
+        yield from self.read_position()
+        self.at_rest_um = self.position_um
 
     def measure(self) -> Procedure:
-        yield from self._read_position_surely()
+        yield from self.read_position_surely()
 
-    def _begin_run(self, run: _Run, phase: int, expected_phase: int) -> Steps[None]:
+    def _begin_run(self, go: Command, phase: int | None, expected: int | None) -> Steps[None]:
         """Start the run once. If that answer is lost, find out; never start it again.
 
         Even a microstep counter that did not change is no proof that nothing moved (a unit may
         count otherwise than the manual says), so only a proof of motion lets us go on.
         """
-        go = pmd_protocol.run_microsteps(self.address, run.microsteps, run.speed_hz)
-        yield pmd_protocol.store(go)
         try:
-            yield pmd_protocol.run_stored(go)
+            yield from self._go(go)
         except PmdTimeoutError:
-            status = yield from self._read_status()
+            status = yield from self.read_status()
             now_at = yield from self._microstep_phase()
-            finished = now_at == expected_phase != phase
+            finished = now_at is not None and now_at == expected != phase
             if not (status & Status.RUNNING or finished):
                 raise self.error(
                     "run_unconfirmed", "the answer to a run was lost; position uncertain"
@@ -192,19 +273,23 @@ class PmdAxis(PmdController):
         deadline_s = run.begun_s + 1.5 * run.duration_s + 2.0
         yield Pause(SETTLE_S)
         while True:
-            status = yield from self._read_status()
+            status = yield from self.read_status()
             yield from self._check_moving()
             # `J` reads 0 after a run; during one it reads 1 or +-222, depending on the unit.
-            if not status & Status.RUNNING and (yield from self._ask("J")).integer() == 0:
+            if not status & Status.RUNNING and (yield from self.ask("J")).integer() == 0:
                 return
             if self._clock() > deadline_s:
                 raise self.error("motion_timeout", f"runs longer than {run.duration_s:.1f} s")
             yield Pause(POLL_PAUSE_S)
 
-    def _microstep_phase(self) -> Steps[int]:
-        values = (yield from self._ask("Y0")).integers()
+    def _microstep_phase(self) -> Steps[int | None]:
+        """None if the board does not tell; the end of a run is then known by its status alone."""
+        reply = yield from self.ask_if_it_can("Y0", "a run's length cannot be checked afterwards")
+        if reply is None:
+            return None
+        values = reply.integers()
         if len(values) != 2 or not 0 <= values[1] < MICROSTEPS_PER_STEP:
-            raise PmdReplyError(self._named(f"microstep counter reads {values}"))
+            raise PmdReplyError(self.named(f"microstep counter reads {values}"))
         return values[1]
 
     def _estimate_um(self, run: _Run) -> float:
@@ -213,53 +298,45 @@ class PmdAxis(PmdController):
 
     # Reference
 
-    def home(self, home_um: int) -> Procedure:
-        """Run to the hard stop (or limit switch) nearest to `home_um`; that place is `home_um`."""
-        self.fault = None
-        yield from self.unpark()
-        self.certain = False
-        travel_um = self.config.travel_max_um - self.config.travel_min_um
-        to_low_end = home_um - self.config.travel_min_um <= self.config.travel_max_um - home_um
-        distance_um = (-1.2 if to_low_end else 1.2) * travel_um
-        try:
-            yield from self.run_open_loop(pmd_units.microsteps_from_um(self.config, distance_um))
-        except AxisFaultError as error:
-            if error.code != "external_limit":  # a switch instead of the stop is as good
-                raise
-        yield pmd_protocol.stop(self.address)
-        yield from self.declare(home_um)
-
     def declare(self, position_um: int) -> Procedure:
         """The axis stands at `position_um`. Out of target mode, or setting E would move it."""
         self.certain = False
+        if self.needs_setup:
+            yield from initialise(self)
+            self.certain = False
         if self.closed_loop:
-            yield pmd_protocol.stop(self.address)
-            count = pmd_units.count_from_um(self.config, position_um)
+            yield from self._leave_target_mode()
+            yield from self.declare_count(pmd_units.count_from_um(self.config, position_um))
+            return
+        self.position_um = float(position_um)
+        self._declared()
+
+    def declare_count(self, count: int) -> Steps[None]:
+        wanted_um = pmd_units.um_from_count(self.config, count)
+        yield from self.read_position()
+        if self.position_um != wanted_um:
             yield Command(self.address, f"E{count}", reads=False)
-            yield from self._read_position()
-            if abs(self.position_um - position_um) > self._jitter_um:
-                raise self.error("setting", f"reads {self.position_um:.0f} um after E{count}")
-            yield from self._set_all({MARK: DECLARED_MARK})
-        else:
-            self.position_um = float(position_um)
-        self._at_rest_um = self.position_um
+            yield from self.read_position()
+        if abs(self.position_um - wanted_um) > self.jitter_um:
+            raise self.error("setting", f"reads {self.position_um:.0f} um after E{count}")
+        yield from self.set_mark(DECLARED_MARK)
+        self._declared()
+
+    def _declared(self) -> None:
+        self.at_rest_um = self.position_um
         self.certain = True
         self.fault = None
 
     # Stopping
 
     def confirm_stop(self) -> Procedure:
-        """Repeat S until the controller says that it stands and regulates nothing."""
+        """Ask, and repeat S, until the controller says that it stands and regulates nothing."""
         while True:
-            yield pmd_protocol.stop(self.address)
-            status = yield from self._read_status()
+            status = yield from self.read_status()
             if not status & (Status.RUNNING | Status.TARGET_MODE):
                 break
-        if status & Status.RESET:
-            self.certain = False
-        yield from self._read_position()
-        self._at_rest_um = self.position_um
-        if not status & (ERRORS | Status.RESET | Status.OVERHEAT):
+            yield pmd_protocol.stop(self.address)
+        if not status & (ERRORS | Status.RESET | Status.OVERHEAT) and not self.needs_setup:
             self.fault = None
 
 

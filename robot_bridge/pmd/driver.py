@@ -8,14 +8,22 @@ drivers, not tried on hardware yet: it says so whenever it starts.
 
 import logging
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
 
 from robot_bridge.daemon.config import AxisConfig
 from robot_bridge.daemon.motors import MotorError, MotorStatus
 from robot_bridge.pmd.axis import PmdAxis
-from robot_bridge.pmd.checks import check_run, check_setpoint, code_and_text
+from robot_bridge.pmd.checks import (
+    check_known,
+    check_run,
+    check_set_up,
+    check_setpoint,
+    code_and_text,
+    same_addresses,
+)
 from robot_bridge.pmd.controller import POWER_ON_DELAY_US
+from robot_bridge.pmd.homing import home
 from robot_bridge.pmd.line import PmdLine, Procedure, Task
 from robot_bridge.pmd.ports import OpenPort, PmdPorts, SerialPort
 from robot_bridge.pmd.protocol import PmdEchoError, PmdError
@@ -46,7 +54,9 @@ class PmdMotors:
         capture_file: Path | None = None,
         clock: Callable[[], float] = time.monotonic,
         open_port: OpenPort | None = None,
+        exclusive: bool = True,
     ) -> None:
+        """exclusive: nobody else may have the ports; only a stop asks for less."""
         self._axes = {
             config.name: PmdAxis(config, clock, response_delay_us=response_delay_us)
             for config in axes
@@ -56,7 +66,7 @@ class PmdMotors:
             timeout_s=timeout_s,
             capture_file=capture_file,
             clock=clock,
-            open_port=open_port or (lambda url: SerialPort(url, baud)),
+            open_port=open_port or (lambda url: SerialPort(url, baud, exclusive=exclusive)),
         )
         self._timeout_s, self._clock = timeout_s, clock
         self._park_after_move = park_after_move
@@ -70,12 +80,17 @@ class PmdMotors:
 
     # Opening and closing
 
+    def know_boards(self, boards: Mapping[str, str]) -> None:
+        for name, board in boards.items():
+            if name in self._axes:
+                self._axes[name].board = board
+
     def open(self) -> MotorStatus:
         log.warning(UNTRIED)
         self._ports.connect()
         deadline_s = self._clock() + INITIALISE_DEADLINE_S
         for axis in self._axes.values():
-            self._run(axis, axis.initialise(), "initialisation", deadline_s)
+            self._run(axis, axis.set_up(), "initialisation", deadline_s)
             log.info("axis %s: %s", axis.config.name, axis.identity)
         self._initialised = True
         return self._status()
@@ -107,20 +122,24 @@ class PmdMotors:
         for axis in self._axes.values():
             if axis.fault is not None:
                 raise MotorError(*axis.fault)
+        for name, axis in axes.items():
+            check_known(axis, setpoints_um[name])
         self._begin(setpoints_um)
         for name, axis in axes.items():
             self._start(name, axis.move(setpoints_um[name], self._park_after_move), "move")
 
-    def home(self) -> None:
+    def home(self, axes: Collection[str] = ()) -> None:
         self._require_ready()
         homes_um = {}
-        for name, axis in self._axes.items():
+        for name in axes or self._axes:
+            axis = self._axis(name)
             if axis.config.home_um is None:
                 raise MotorError("no_home", f"axis {name}: home_mm is not in the configuration")
+            check_set_up(axis)
             homes_um[name] = axis.config.home_um
         self._begin(homes_um)
         for name, home_um in homes_um.items():
-            self._start(name, self._axes[name].home(home_um), "home")
+            self._start(name, home(self._axes[name], home_um), "home")
 
     def run_steps(self, name: str, steps: int) -> None:
         """Begin an open-loop run of waveform steps, forward positive, of one axis (calibration).
@@ -130,6 +149,7 @@ class PmdMotors:
         """
         self._require_ready()
         axis = self._axis(name)
+        check_set_up(axis)
         check_run(axis, steps)
         self._begin({})
         self._start(name, axis.run_steps(steps), "run")
@@ -202,7 +222,7 @@ class PmdMotors:
             self._try_to_reconnect()
             return
         if not self._motion and not self._other:
-            self._for_each_axis(lambda axis: axis.refresh(), "status")
+            self._for_each_axis(_look_after, "status")
         share_s = POLL_BUDGET_S / len(self._ports.lines)
         for line in self._ports.lines.values():
             line.step(share_s)
@@ -260,12 +280,32 @@ class PmdMotors:
             moving=bool(self._motion),
             reached=self._reached,
             readback_um={name: axis.readback_um() for name, axis in self._axes.items()},
-            certain=self._initialised and all(axis.certain for axis in self._axes.values()),
+            certain_axes=frozenset(
+                name for name, axis in self._axes.items() if self._initialised and axis.certain
+            ),
             parked=all(axis.parked for axis in self._axes.values()),
             fault=fault[0] if fault else None,
             fault_text=fault[1] if fault else "",
-            warnings=(UNTRIED, *self._park_warnings()),
+            warnings=(UNTRIED, *self._doubts(), *self._park_warnings()),
+            setting_up=any(axis.needs_setup for axis in self._axes.values()),
+            boards={name: axis.board for name, axis in self._axes.items()},
+            supply={
+                name: {
+                    "volts_48": axis.supply.volts_48,
+                    "board_celsius": axis.supply.board_celsius,
+                }
+                for name, axis in self._axes.items()
+                if axis.supply is not None
+            },
         )
+
+    def _doubts(self) -> list[str]:
+        said = [
+            f"axis {name}: no answer to '{what}': {text}"
+            for name, axis in self._axes.items()
+            for what, text in axis.doubts.items()
+        ]
+        return said + same_addresses([axis.config for axis in self._axes.values()])
 
     def _park_warnings(self) -> list[str]:
         return [
@@ -276,16 +316,17 @@ class PmdMotors:
 
     # A port that goes away and comes back (a plug, a converter)
 
-    def _lose_port(self, text: str) -> None:
+    def _lose_port(self, text: str, code: str = "port_failed") -> None:
         """Stop what can still be reached, and begin again from opening. Positions are lost."""
         if self._reconnect_s is None:
             log.error("%s", text)
         self._ports.send_stop()
         self._ports.close()
         self._motion, self._other = {}, {}
-        self._fault, self._reached = ("port_failed", text), False
+        self._fault, self._reached = (code, text), False
         for axis in self._axes.values():
             axis.certain = False
+            axis.needs_setup = True
         self._reconnect_s = self._clock() + RECONNECT_PAUSE_S
 
     def _try_to_reconnect(self) -> None:
@@ -298,13 +339,15 @@ class PmdMotors:
             self._ports.close()
             self._fault = (error.code, error.text)
             return
-        self._for_each_axis(lambda axis: axis.initialise(), "initialisation")
+        self._for_each_axis(lambda axis: axis.set_up(), "initialisation")
 
     def _finish_reconnecting(self, failed: tuple[str, str] | None) -> None:
         if failed:
-            self._lose_port(failed[1])
+            self._lose_port(failed[1], failed[0])
         elif not self._other:
             log.warning("the controllers answer again; declare the position, or home")
+            for axis in self._axes.values():
+                axis.fault = None
             self._fault, self._reconnect_s = None, None
 
     # Stopping
@@ -331,6 +374,15 @@ class PmdMotors:
             self._ports.close()  # initialised again from the start, by `poll`
         if failures:
             raise MotorError("stop_unconfirmed", "; ".join(failures))
+
+
+def _look_after(axis: PmdAxis) -> Procedure:
+    """What an axis needs while nothing moves."""
+    if not axis.needs_setup:
+        yield from axis.refresh()
+        return
+    yield from axis.set_up()
+    axis.fault = None
 
 
 def _addresses_by_url(axes: Sequence[AxisConfig]) -> dict[str, list[int]]:

@@ -15,6 +15,7 @@ from robot_bridge.pmd.protocol import (
     Command,
     LineReader,
     PmdError,
+    PmdNoValueError,
     PmdTimeoutError,
     Reply,
     match_reply,
@@ -88,6 +89,9 @@ class _Transaction:
     tries_left: int
     echo_due: bool  # a copy of our own bytes comes first
     retried: bool
+    copied: bool = False  # a bare copy of the command has come
+    heard: bool = False  # something has come, but no answer to this
+    misses: int = 0  # earlier tries in which the same happened
 
 
 class PmdLine:
@@ -173,12 +177,14 @@ class PmdLine:
         if task.done and task in self._tasks:
             self._tasks.remove(task)
 
-    def _send(self, task: Task, command: Command, tries: int) -> None:
+    def _send(self, task: Task, command: Command, tries: int, misses: int = 0) -> None:
         self._port.reset_input_buffer()
         self._reader.clear()
         deadline_s = self._clock() + self.timeout_s
         retried = tries < TRIES and command.repeatable
-        self._current = _Transaction(task, command, deadline_s, tries - 1, self.own_echo, retried)
+        self._current = _Transaction(
+            task, command, deadline_s, tries - 1, self.own_echo, retried, misses=misses
+        )
         self.transactions += 1
         self._port.write(command.line)
 
@@ -191,9 +197,9 @@ class PmdLine:
 
     def _take_line(self, current: _Transaction, line: str) -> None:
         if line == current.command.text and (current.echo_due or current.command.reads):
-            # A bare copy of a read command can only be the adapter's echo.
+            # A bare copy of a question: the adapter's echo, if an answer follows.
             current.echo_due = False
-            self.own_echo = True
+            current.copied = current.heard = True
             return
         try:
             reply = match_reply(current.command, line)
@@ -204,18 +210,23 @@ class PmdLine:
             return
         if reply is None:
             self.chatter_lines += 1
+            current.heard = True
             return
         self._current = None
+        self.own_echo = self.own_echo or (current.copied and current.command.reads)
         self._resume(current.task, replace(reply, retried=current.retried))
 
     def _timed_out(self, current: _Transaction) -> None:
         self._current = None
+        # An adapter that echoes is heard whether or not the board says anything.
+        misses = current.misses + (current.heard and not self.own_echo)
         if current.tries_left > 0:
             self.retries += 1
-            self._send(current.task, current.command, current.tries_left)
+            self._send(current.task, current.command, current.tries_left, misses)
             return
         said = f"; {self._reader.pending!r} came" if self._reader.pending else ""
-        error = PmdTimeoutError(
+        unknown = current.command.repeatable and misses == TRIES
+        error = (PmdNoValueError if unknown else PmdTimeoutError)(
             f"controller {current.command.address} did not answer '{current.command.text}' "
             f"within {self.timeout_s * 1000:.0f} ms{said}"
         )

@@ -22,10 +22,19 @@ OpenPort = Callable[[str], Port]
 class SerialPort:
     """A device, a pseudo-terminal or any other pyserial URL. Every failure is an OSError."""
 
-    def __init__(self, url: str, baud: int) -> None:
+    def __init__(self, url: str, baud: int, *, exclusive: bool = True) -> None:
         # pyserial's write timeout strikes after a whole write too, when the computer is busy, and
         # without one it may wait for ever: so it writes what it can, and waiting is done here.
-        self._port = serial.serial_for_url(url, baudrate=baud, timeout=READ_WAIT_S, write_timeout=0)
+        self._port = serial.serial_for_url(
+            url,
+            baudrate=baud,
+            timeout=READ_WAIT_S,
+            write_timeout=0,
+            exclusive=True if exclusive else None,
+        )
+        # An FTDI adapter holds answers back for 16 ms unless it is told not to.
+        with contextlib.suppress(AttributeError, OSError, ValueError, NotImplementedError):
+            self._port.set_low_latency_mode(True)
 
     def read(self, size: int = 1, /) -> bytes:
         data: bytes = self._port.read(size)

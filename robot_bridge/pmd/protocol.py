@@ -30,6 +30,10 @@ class PmdTimeoutError(PmdError):
     """No whole answer came in time (line or controller)."""
 
 
+class PmdNoValueError(PmdTimeoutError):
+    """Something else came, every time: the board lives, and does not know the command."""
+
+
 class PmdSyntaxError(PmdError):
     """The controller did not understand the command (`_??_`)."""
 
@@ -144,6 +148,12 @@ def _checked_speed(speed_hz: int) -> int:
     if not isinstance(speed_hz, int) or not 1 <= speed_hz <= 2500:
         raise PmdCommandError(f"drive frequency {speed_hz!r} Hz is outside 1..2500 Hz")
     return speed_hz
+
+
+def run_to_index(address: int, microsteps: int, speed_hz: int) -> Command:
+    """`I`: as `J`, until the encoder's index is passed. Relative: never to be repeated."""
+    run = run_microsteps(address, microsteps, speed_hz)
+    return Command(address, "I" + run.body[1:], reads=False, repeatable=False)
 
 
 def stop(address: int) -> Command:

@@ -59,6 +59,32 @@ def names(status: Status) -> str:
 
 
 @dataclass(frozen=True)
+class Inputs:
+    """The limit switches as they stand; each stops motion in its own direction alone."""
+
+    reverse: bool
+    forward: bool
+
+
+LIMITS_OFF, ACTIVE_HIGH = 0, 1
+
+
+def parse_inputs(text: str, wiring: int) -> Inputs:
+    """A `U1` answer: two hex digits, outputs and inputs; in1 is limit reverse, in2 forward.
+
+    wiring: Y2, 0 not connected (no switch is active), 1 active high, 2 active low.
+    """
+    digits = text.strip()
+    if len(digits) != 2 or not all(c in "0123456789abcdefABCDEF" for c in digits):
+        raise PmdReplyError(f"inputs '{text}' are not two hexadecimal digits")
+    if wiring == LIMITS_OFF:
+        return Inputs(reverse=False, forward=False)
+    inputs = int(digits[1], 16)
+    level = wiring == ACTIVE_HIGH
+    return Inputs(reverse=bool(inputs & 2) is level, forward=bool(inputs & 4) is level)
+
+
+@dataclass(frozen=True)
 class Supply:
     """A `U2` answer: supply voltages, the motor test figure and the board's temperature."""
 

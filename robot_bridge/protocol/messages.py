@@ -8,7 +8,7 @@ schema hash, which every frame's checksum covers.
 
 import hashlib
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from enum import StrEnum
 from typing import Any, ClassVar
 
@@ -83,11 +83,16 @@ class Code(StrEnum):
 
 @dataclass(frozen=True)
 class AxisTravel:
-    """An axis and its travel limits, both ends allowed, integer micrometres."""
+    """An axis and its travel limits, both ends allowed, integer micrometres.
+
+    tolerance_um: what two readings of an axis that stands may differ by; one that is asked to be
+        where it stands, within this, is not moved.
+    """
 
     name: str
     min_um: int
     max_um: int
+    tolerance_um: int = 20
 
 
 @dataclass(frozen=True)
@@ -171,17 +176,40 @@ class Move(Message):
 
 @dataclass(frozen=True)
 class Home(Message):
+    """Of these axes; none named: all."""
+
     KIND = 0x16
     command_id: str
     by: str
     seen_ms: int
+    axes: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True)
 class DeclarePosition(Message):
+    """The named axes, and no others, stand there, give or take `within_um`.
+
+    Without a bound the word counts as exact, unless it only repeats what the bridge guessed.
+    """
+
     KIND = 0x17
     positions_um: dict[str, int]
     by: str
+    seen_ms: int
+    within_um: dict[str, int] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class CorrectPosition(Message):
+    """What images say: the axis truly stands `correction_um` beyond its count, give or take
+    `within_um`. Counts and setpoints stay what they are; only the travel that is left changes.
+    `based_on_motion`: the last motion when that was seen.
+    """
+
+    KIND = 0x18
+    correction_um: dict[str, int]
+    within_um: dict[str, int]
+    based_on_motion: str
     seen_ms: int
 
 
@@ -213,8 +241,15 @@ class Status(Message):
 
     stop_count: the number of the newest stop (the journal counts them); `stopped`: it is latched.
     last_motion: names the last thing that changed where the robot stands (a command id, or
-        "boot:…", "declared:…"); a move must be based on it.
+        "boot:…", "declared:…", "lost:…"); a move must be based on it.
     command_*: the command in flight, or the last one that ended.
+    certain_axes: whose positions are known; `position_certain` says that all are.
+    bound_um: of a certain axis, within how much of positions_um + correction_um it stands; of
+        another one, within how much of remembered_um. An axis that is missing is simply unknown.
+    remembered_um: where axes that are not certain stood when it was last known: a guess.
+    correction_um: what images last said that the truth is beyond the count.
+    motions: how many things since the boot have moved the robot, or may have: commands, parking,
+        motions that nobody asked for.
     """
 
     KIND = 0x82
@@ -239,6 +274,11 @@ class Status(Message):
     command_readback_um: dict[str, int]
     frames_bad: int
     refused: int
+    certain_axes: tuple[str, ...] = ()
+    bound_um: dict[str, int] = field(default_factory=dict)
+    remembered_um: dict[str, int] = field(default_factory=dict)
+    correction_um: dict[str, int] = field(default_factory=dict)
+    motions: int = 0
 
 
 @dataclass(frozen=True)
@@ -264,7 +304,7 @@ MESSAGES: dict[int, type[Message]] = {
     kind.KIND: kind
     for kind in (
         HelloRequest, Heartbeat, Arm, Disarm, Rearm, SetPhase, SetInsertionLock, Move, Home,
-        DeclarePosition, Hello, Status, Answer, NoSession,
+        DeclarePosition, CorrectPosition, Hello, Status, Answer, NoSession,
     )
 }  # fmt: skip
 
@@ -308,10 +348,19 @@ def _positions(value: Any) -> dict[str, int]:
     return dict(value)
 
 
+def _names(value: Any) -> tuple[str, ...]:
+    if not isinstance(value, list | tuple) or len(value) > 32:
+        raise MessageError("names are not a list of at most 32")
+    return tuple(_text(name) for name in value)
+
+
 def _axes(value: Any) -> tuple[AxisTravel, ...]:
-    if not isinstance(value, list | tuple) or any(len(axis) != 3 for axis in value):
-        raise MessageError("axes are not a list of (name, min, max)")
-    return tuple(AxisTravel(_text(n), _integer(lo), _integer(hi)) for n, lo, hi in value)
+    if not isinstance(value, list | tuple) or any(len(axis) != 4 for axis in value):
+        raise MessageError("axes are not a list of (name, min, max, tolerance)")
+    return tuple(
+        AxisTravel(_text(n), _integer(lo), _integer(hi), _integer(tolerance))
+        for n, lo, hi, tolerance in value
+    )
 
 
 _CHECKS: dict[Any, Callable[[Any], Any]] = {
@@ -321,20 +370,23 @@ _CHECKS: dict[Any, Callable[[Any], Any]] = {
     str | None: _text_or_none,
     dict[str, int]: _positions,
     tuple[AxisTravel, ...]: _axes,
+    tuple[str, ...]: _names,
 }
 
 
 def _plain(value: Any) -> Any:
+    if isinstance(value, tuple) and value and isinstance(value[0], str):
+        return [str(name) for name in value]
     if isinstance(value, tuple):
-        return [[axis.name, axis.min_um, axis.max_um] for axis in value]
+        return [[axis.name, axis.min_um, axis.max_um, axis.tolerance_um] for axis in value]
     return str(value) if isinstance(value, StrEnum) else value
 
 
 def pack(message: Message) -> bytes:
     """The CBOR payload. Raises MessageError if a field is not what the schema says."""
-    plain = [_plain(getattr(message, field.name)) for field in fields(message)]
-    for field, value in zip(fields(message), plain, strict=True):
-        _checked(type(message), field.name, field.type, value)
+    plain = [_plain(getattr(message, column.name)) for column in fields(message)]
+    for column, value in zip(fields(message), plain, strict=True):
+        _checked(type(message), column.name, column.type, value)
     return cbor2.dumps(plain)
 
 
@@ -365,7 +417,7 @@ def schema_text() -> str:
     """One line a message: type byte, name, fields in order with their types."""
     lines = [f"protocol {PROTOCOL_VERSION}"]
     for kind, cls in sorted(MESSAGES.items()):
-        columns = ", ".join(f"{field.name}: {_type_name(field.type)}" for field in fields(cls))
+        columns = ", ".join(f"{column.name}: {_type_name(column.type)}" for column in fields(cls))
         lines.append(f"0x{kind:02x} {cls.__name__}({columns})")
     return "\n".join(lines)
 

@@ -32,7 +32,7 @@ function draw(state) {
   drawProposals({ proposals: state.proposals ?? [], role: page.role });
   drawJog({ positions_um: robot.positions_um, possible: page.role === "operator" && state.jog_possible });
   drawCase({ description: state.case, case_uid: state.case_uid, role: page.role });
-  drawScannerClock({ clock: state.clock, role: page.role });
+  drawScannerClock({ clock: state.clock, clock_implies: state.clock_implies, role: page.role });
   drawParts({ robot: { linked: robot.linked, boot_id: robot.boot_id, problem: robot.problem }, processes: state.processes, slices: state.slices });
   newAside([state.slices.quarantined, state.hold?.hold_id, page.role]);
   newTargets([state.target_patient_mm, state.procedure, page.role]);

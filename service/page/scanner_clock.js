@@ -4,11 +4,11 @@
 import { order } from "./api.js";
 import { byId, h, replace, setText, whenChanged } from "./dom.js";
 import { act } from "./actions.js";
-import { day } from "./format.js";
+import { age, day } from "./format.js";
 
 const DAY_S = 86400;
-// a person presses within this of the second that is shown (1 sigma of eye and hand, and its rounding)
-const UNCERTAINTY_S = 0.5;
+// a person presses within this of the second that is shown: its rounding, and the time to react
+const UNCERTAINTY_S = 1.0;
 
 const heardS = [];
 
@@ -17,6 +17,15 @@ const heardS = [];
 export function heardFromRoom(nowS) {
   heardS.push(nowS - Date.now() / 1000);
   if (heardS.length > 50) heardS.shift();
+}
+
+const nowS = () => Date.now() / 1000 + roomMinusBrowserS();
+
+// An age goes on by itself: nothing else on the card is drawn anew for it.
+function ageOf(instantS) {
+  const text = h("span", { id: "clock-age" }, age(nowS() - instantS));
+  const timer = setInterval(() => (text.isConnected ? setText(text, age(nowS() - instantS)) : clearInterval(timer)), 5000);
+  return text;
 }
 
 const roomMinusBrowserS = () => (heardS.length ? Math.max(...heardS) : 0);
@@ -43,10 +52,10 @@ function inWords(offset) {
   return `is ${Math.abs(offset).toFixed(1)} s ${offset < 0 ? "ahead of" : "behind"} the room's`;
 }
 
-export const drawScannerClock = whenChanged(({ clock, role }) => {
+export const drawScannerClock = whenChanged(({ clock, clock_implies, role }) => {
   const known = clock
-    ? `The scanner's clock ${inWords(clock.offset_s)}, ± ${clock.uncertainty_s} s; ${clock.compared_s ? `compared ${day(clock.compared_s)} by ${clock.who}` : "as configured"}.`
-    : "Not compared yet: it is estimated from the slices as they arrive.";
+    ? [`The scanner's clock ${inWords(clock.offset_s)}, ± ${clock.uncertainty_s} s; compared ${day(clock.compared_s)} by ${clock.who}, `, ageOf(clock.compared_s), ` ago. ${clock_implies}`]
+    : [clock_implies];
   const input = h("input", { id: "scanner-shows", placeholder: "hh:mm:ss", inputMode: "numeric", autocomplete: "off", size: 9, disabled: role !== "operator" });
   const said = h("p", { class: "quiet", role: "status" });
   let offset = NaN;
@@ -61,9 +70,9 @@ export const drawScannerClock = whenChanged(({ clock, role }) => {
     },
   }, "It shows this now");
   const forget = h("button", {
-    type: "button", disabled: role !== "operator", title: "The next slices show it anew; they must come promptly.",
+    type: "button", disabled: role !== "operator", title: "Slices wait until the clocks are compared again.",
     onclick: () => act(() => order("POST", "api/v1/clock/reset", { why: "said on the page" })),
   }, "It was set anew: forget this");
-  replace(byId("scanner-clock"), h("p", { class: "quiet" }, known),
+  replace(byId("scanner-clock"), h("p", { class: "quiet" }, ...known),
     h("p", {}, h("label", { htmlFor: "scanner-shows" }, "The scanner shows "), input, " ", compare), said, use, clock ? h("p", {}, forget) : null);
 });

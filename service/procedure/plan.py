@@ -70,6 +70,7 @@ def plan_move(
     setpoints_um = dict(estimate.setpoints_um)
     for axis, change in change_mm.items():
         setpoints_um[axis] += round(change * 1000.0)
+    setpoints_um = held_inside(setpoints_um, estimate.setpoints_um, travel)
     check_travel(setpoints_um, travel)
     return Plan(
         plan_id,
@@ -101,6 +102,23 @@ def why_void(
             f"({newest_measurement_id})"
         )
     return ""
+
+
+def held_inside(
+    setpoints_um: Mapping[str, int], from_um: Mapping[str, int], travel: Mapping[str, Travel]
+) -> dict[str, int]:
+    """Return the setpoints with every axis that stays at the very end of its travel put inside it.
+
+    An encoder may read a little beyond the end that was reached; that must not hold up the others.
+    """
+    held = dict(setpoints_um)
+    for axis, limits in travel.items():
+        if axis not in held or abs(held[axis] - from_um.get(axis, held[axis])) > SAME_PLACE_UM:
+            continue
+        inside_um = min(max(held[axis], limits.min_um), limits.max_um)
+        if abs(inside_um - held[axis]) <= SAME_PLACE_UM:
+            held[axis] = inside_um
+    return held
 
 
 def check_travel(setpoints_um: Mapping[str, int], travel: Mapping[str, Travel]) -> None:

@@ -91,15 +91,15 @@ def _is_another_scan(record: CaseRecord, measurement: Measurement) -> bool:
 
 
 def positions_to_declare(record: CaseRecord, positions_um: Mapping[str, int]) -> dict[str, int]:
-    """Where the robot is taken to stand after a restart, per axis: by its count, or by the record.
+    """Where axes are taken to stand after a restart, each by its own count, or by the record.
 
-    Controllers without encoders that were switched off count from zero wherever they stand. Were
-    that taken for the truth, the travel limits would wander with every restart. So where the count
-    is zero and the record knows better, the record is believed; of a move that came to no end, half
-    of it. Either is uncertain: the next procedure looks before it moves.
+    positions_um: the counts of the axes in question. Controllers without encoders that were
+    switched off count from zero wherever they stand. Were that taken for the truth, the travel
+    limits would wander with every restart. So where a count is zero and the record knows better,
+    the record is believed; of a move that came to no end, half of it. It is a guess either way.
     """
     holds, moves = record.holds(), record.moves()
-    if any(positions_um.values()) or not holds:
+    if not holds:
         return dict(positions_um)
     known = dict(holds[-1].readback_um)
     last = moves[-1] if moves else None
@@ -109,4 +109,4 @@ def positions_to_declare(record: CaseRecord, positions_um: Mapping[str, int]) ->
         known = {
             axis: (at_um + last.setpoints_um.get(axis, at_um)) // 2 for axis, at_um in known.items()
         }
-    return {axis: known.get(axis, at_um) for axis, at_um in positions_um.items()}
+    return {axis: at_um or known.get(axis, at_um) for axis, at_um in positions_um.items()}

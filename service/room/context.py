@@ -84,7 +84,7 @@ class Room:
         return configured if guide or guide is None else None
 
     def travel(self) -> dict[str, Travel]:
-        return {axis: Travel(low, high) for axis, (low, high) in self.link.travel_um.items()}
+        return {axis: Travel(low, high) for axis, (low, high) in self.link.travel_left_um.items()}
 
     def seed(self) -> int:
         """Of the next procedure's random choices: from the case's seed and its number."""

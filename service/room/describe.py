@@ -33,11 +33,12 @@ from service.room.motion_allowed import may_start
 from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
 from service.room.prompt import is_calibrated, outcome_text, prompt
 from service.room.proposals import ProposalBook
+from service.room.scanner_clock import clock_update
 from service.room.state import (
     AcquisitionState,
     ArrivalState,
     CaseState,
-    ClockState,
+    FiducialState,
     HoldState,
     LostState,
     MeasurementState,
@@ -103,7 +104,7 @@ class Describer:
                 **_slices(record),
                 "measurement": _measurement(record, measurement, now),
                 **self._around(measurement, before),
-                "clock": _clock(config, record),
+                **clock_update(config, record, time.time()),
                 "calibrated": is_calibrated(config, record),
                 "target_patient_mm": tuple(target_mm) if target_mm else None,
                 "entry_patient_mm": current_entry(record),
@@ -114,6 +115,8 @@ class Describer:
                 "proposals": self._proposals.update(record),
             }
         )
+        other = _other(record, state.other_fiducial, now)
+        state = state.model_copy(update={"other_fiducial": other})
         alarms = self._alarms.update([*conditions(state), *self._others_wrong()], record)
         state = state.model_copy(update={"alarms": alarms})
         same = _timeless(state) == _timeless(before)
@@ -255,6 +258,15 @@ def _measurement(record: CaseRecord, last: Measurement | None, now: Now) -> Meas
     return describe_measurement(last).model_copy(update=update)
 
 
+def _other(record: CaseRecord, other: FiducialState | None, now: Now) -> FiducialState | None:
+    """The other fiducial, and whether it is still there."""
+    if other is None:
+        return None
+    lost = why_not_now(record, record.measurement(other.measurement_id), now)
+    said = None if lost is None else LostState(code=lost.code, text=lost.text)
+    return other.model_copy(update={"lost": said})
+
+
 def _error(
     config: Config, record: CaseRecord, target: Target | None, void: str, now: Now
 ) -> dict[str, Any]:
@@ -285,22 +297,3 @@ def _timeless(state: RoomState) -> RoomState:
 def _punctured(record: CaseRecord, procedure_id: int) -> bool:
     puncture = record.last_event("puncture")
     return puncture is not None and puncture.body["procedure_id"] == procedure_id
-
-
-def _clock(config: Config, record: CaseRecord) -> ClockState | None:
-    compared = record.last_event("clock_sync")
-    forgotten = record.last_event("clock_reset")
-    listener = config.listener
-    if forgotten is not None and (compared is None or compared.event_id < forgotten.event_id):
-        return None
-    if compared is not None:
-        offset_s, uncertainty_s = (compared.body[k] for k in ("offset_s", "uncertainty_s"))
-        return ClockState(
-            offset_s=offset_s,
-            uncertainty_s=uncertainty_s,
-            compared_s=compared.wall_s,
-            who=compared.who,
-        )
-    if listener.clock_offset_s is None:
-        return None
-    return ClockState(offset_s=listener.clock_offset_s, uncertainty_s=listener.clock_uncertainty_s)

@@ -33,6 +33,7 @@ from service.room.going_on import GO_ON, Permitted
 from service.room.link import RoomLink
 from service.room.measuring import measure_request, measured_from_result
 from service.room.present import RESTS_ON, bridge_facts, rests_on, why_stood_no_more
+from service.room.scanner_clock import clock_margin_s
 from sr_engine.worker import is_at_position
 
 _SERVICE = "service"
@@ -299,7 +300,10 @@ class Execution:
 
     def _let_clocks_agree(self, hold: Hold) -> None:
         """Ask for slices only when the hold is older than the scanner's clock is uncertain."""
-        while time.time() < hold.settled_at_s + self._config.service.settle_s:
+        now_s = time.time()
+        margin_s = clock_margin_s(self._config, self._record, now_s)
+        wait_s = max(self._config.service.settle_s, margin_s)
+        while time.time() < hold.settled_at_s + wait_s:
             self.prompt = "Standing still before the next slice."
             self._wait()
 

@@ -57,6 +57,19 @@ class RoomLink:
         """The bridge as it last said it was, or None while there is no session."""
         return self.client.status if self.is_up else None
 
+    @property
+    def travel_left_um(self) -> dict[str, tuple[int, int]]:
+        """By axis, the counts at which it is sure to be within its travel.
+
+        A count is off by what images last said of it, and known to within a bound only.
+        """
+        status, left = self.status, dict(self.travel_um)
+        for axis, bound_um in (status.bound_um if status else {}).items():
+            if status and axis in left and axis in status.certain_axes:
+                (low_um, high_um), off_um = left[axis], status.correction_um.get(axis, 0)
+                left[axis] = (low_um + bound_um - off_um, high_um - bound_um - off_um)
+        return left
+
     def pump(self, wait_s: float) -> None:
         """Serve the line for `wait_s`; opens it again, at most twice a second, when it is down."""
         if not self.is_up and time.monotonic() >= self._next_open_s:

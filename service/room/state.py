@@ -88,10 +88,11 @@ class FiducialState(_Frozen):
     measurement_id: int
     patient_mm: tuple[float, float, float]
     radius_mm: float
+    lost: LostState | None = None
 
 
 class ClockState(_Frozen):
-    """How the scanner's clock goes: ours minus the scanner's; compared_s None: as configured."""
+    """How the scanner's clock goes: ours minus the scanner's, as compared at `compared_s`."""
 
     offset_s: float
     uncertainty_s: float
@@ -233,6 +234,7 @@ class RoomState(_Frozen):
     reconstruction: ReconstructionState | None = None
     other_fiducial: FiducialState | None = None
     clock: ClockState | None = None
+    clock_implies: str = ""
     hold: HoldState | None = None
     entry_patient_mm: tuple[float, float, float] | None = None
     punctured: bool = False

@@ -37,7 +37,11 @@ _MOST_REPLIES = 256
 _BETWEEN_ANSWERS_S = 0.01
 _PROPOSALS_AT_ONCE, _PROPOSALS_PER_S = 10.0, 1.0
 _STOP_AGAIN_S = 0.1
-_STOPPED_WITHIN_S = 1.0
+_STOPPED_WITHIN_S = 0.7
+_NOT_STOPPED = {
+    "on_its_way": ("on its way", "STOP is on its way: the robot does not stand yet"),
+    "not_delivered": ("not delivered", "NOT DELIVERED: use the stop switch at the robot"),
+}
 _LOOK_S = 0.02
 
 log = structlog.get_logger("openigtlink")
@@ -56,7 +60,11 @@ class Room(Protocol):
 
     def pose(self) -> Pose | None: ...
 
-    def stop(self, by: str, *, emergency: bool) -> None: ...
+    def stop(self, by: str, *, emergency: bool) -> int: ...
+
+    def stop_outcome(self) -> str: ...
+
+    def stop_answered(self, number: int) -> None: ...
 
     def call(self, name: str, arguments: dict[str, Any]) -> Any: ...
 
@@ -156,25 +164,30 @@ class Peer:
     def _stop(self, message: Received, word: str) -> None:
         now_s = time.monotonic()
         if now_s - self._stopped_at_s > _STOP_AGAIN_S:
-            self._room.stop(f"OpenIGTLink {self.name}", emergency=word == "EMERGENCY")
+            number = self._room.stop(f"OpenIGTLink {self.name}", emergency=word == "EMERGENCY")
             self._stopped_at_s = now_s
             log.warning("stop", peer=self.name, word=word)
-            task = asyncio.create_task(self._tell_stop(word))
+            task = asyncio.create_task(self._tell_stop(word, number))
             self._telling.add(task)
             task.add_done_callback(self._telling.discard)
         self._reply(acknowledge(message, self._room.state))
 
-    async def _tell_stop(self, word: str) -> None:
+    async def _tell_stop(self, word: str, number: int) -> None:
         """What became of a STOP, within a second."""
         until_s = time.monotonic() + _STOPPED_WITHIN_S
-        while time.monotonic() < until_s and not self._room.state.robot.stopped:
-            await asyncio.sleep(_LOOK_S)
+        try:
+            while (outcome := self._room.stop_outcome()) != "stopped":
+                if time.monotonic() > until_s:
+                    break
+                await asyncio.sleep(_LOOK_S)
+        finally:
+            self._room.stop_answered(number)
         state = self._room.state
-        if state.robot.linked and state.robot.stopped:
-            self._reply(status_of(state, state.robot.phase))
+        if outcome == "stopped":
+            self._reply(status_of(state, word))
             return
-        text = "NOT DELIVERED: use the stop switch at the robot"
-        self._reply(status(word, state.at_s, STATUS_NOT_READY, "not delivered", text))
+        name, text = _NOT_STOPPED[outcome]
+        self._reply(status(word, state.at_s, STATUS_NOT_READY, name, text))
 
     async def _work(self) -> None:
         while True:

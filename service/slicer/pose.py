@@ -9,18 +9,17 @@ from numpy.typing import NDArray
 
 from case_record.record import CaseRecord
 from room_config.load import Config
-from service.procedure.calibration import Calibration
 from service.procedure.fiducial_plan import gate_of
 from service.procedure.guide_geometry import GuideSeenWrongError, line_of_state
 from service.procedure.guide_plan import geometry_of
 from service.procedure.registry import latest_calibration
-from service.procedure.start_point import POSITION_DECLARED
 from service.room.state import ArrivalState, RoomState
 from service.slicer.messages import INVALID, TRANSFORM_STATUS, VALID, Message, transform
 from service.slicer.scene import axes_along, standing
 
 Array = NDArray[np.float64]
 CURRENT_POSITION = "CURRENT_POSITION"
+_ONLY_MOVED = ("moved", "moving")
 _RAS_AXES = np.diag([-1.0, -1.0, 1.0])
 
 
@@ -56,7 +55,7 @@ def pose_message(pose: Pose | None, at_s: float) -> Message:
 
 
 def pose_of(state: RoomState, record: CaseRecord | None, config: Config) -> Pose | None:
-    """None where nobody knows: no link, not calibrated, the robot's count was set by hand since.
+    """None where nobody knows: not calibrated, or more than a move has happened since it was seen.
 
     With two fiducials the origin is the lower ball joint, at READY the needle's tip; with one it is
     the fiducial, and the axes are the patient's: one point has no direction.
@@ -68,7 +67,10 @@ def pose_of(state: RoomState, record: CaseRecord | None, config: Config) -> Pose
     if seen is not None and config.service.guide is None:
         sigma_mm = float(np.sqrt(np.trace(np.array(seen.covariance_mm2 or np.zeros((2, 2)))) / 2))
         return Pose(_RAS_AXES, np.array(seen.patient_mm), "fiducial", sigma_mm, True)
-    if record is None or not state.robot.linked or not state.robot.position_certain:
+    last = state.measurement
+    if record is None or last is None or not state.robot.linked:
+        return None
+    if last.lost is not None and last.lost.code not in _ONLY_MOVED:
         return None
     return _carried(state, record, config)
 
@@ -82,7 +84,7 @@ def _arrived(arrival: ArrivalState) -> Pose:
 def _carried(state: RoomState, record: CaseRecord, config: Config) -> Pose | None:
     guide = config.service.guide
     known = latest_calibration(record, guide=guide is not None)
-    if known is None or _was_declared_since(record, known):
+    if known is None:
         return None
     here = dict(state.robot.positions_um)
     if not set(known.jacobian.axes) <= set(here):
@@ -103,9 +105,3 @@ def _carried(state: RoomState, record: CaseRecord, config: Config) -> Pose | Non
         return None
     axes = axes_along(-np.array(line.direction))
     return Pose(axes, np.array(line.point_mm), "lower ball joint", sigma_mm, measured)
-
-
-def _was_declared_since(record: CaseRecord, known: Calibration) -> bool:
-    declared = record.last_event(POSITION_DECLARED)
-    finished_s = record.measurement(known.measurement_id).finished_s
-    return declared is not None and finished_s is not None and declared.wall_s > finished_s

@@ -70,12 +70,11 @@ class Standing:
 
 
 def standing(state: RoomState) -> Standing:
-    """The one place that asks whether what was seen still holds."""
-    robot, seen = state.robot, state.measurement
-    still = robot.linked and robot.position_certain and not robot.moving
-    shown = seen if still and seen is not None and seen.patient_mm is not None else None
-    other = state.other_fiducial if shown else None
-    made = state.reconstruction
+    """The one place that asks whether what was seen still holds; `present` has said so."""
+    seen, other, made = state.measurement, state.other_fiducial, state.reconstruction
+    still = state.robot.linked and not state.robot.moving
+    shown = seen if still and seen and seen.patient_mm and seen.lost is None else None
+    other = other if still and other and other.lost is None else None
     numbers = {one.measurement_id for one in (shown, other) if one is not None}
     return Standing(
         measurement=shown,

@@ -102,8 +102,14 @@ class OpenIgtLinkServer:
         state = self._loop.state
         return stale(state) if self._loop.state_age_s > STALE_S else state
 
-    def stop(self, by: str, *, emergency: bool) -> None:
-        self._loop.stop(by, emergency=emergency)
+    def stop(self, by: str, *, emergency: bool) -> int:
+        return self._loop.stop(by, emergency=emergency)
+
+    def stop_outcome(self) -> str:
+        return self._loop.stop_outcome()
+
+    def stop_answered(self, number: int) -> None:
+        self._loop.stop_answered(number)
 
     def call(self, name: str, arguments: dict[str, Any]) -> Any:
         return self._loop.call(name, arguments)

@@ -108,9 +108,16 @@ def _set_time(data_set: FileDataset, began_s: float) -> None:
     data_set.AcquisitionDuration = 0.5
 
 
+# somebody has compared the clocks, which are equal, when the room's file was written
+COMPARED = {"clock_offset_s": 0.0, "clock_uncertainty_s": 0.1}
+
+
 def write_room(folder: Path, **listener: Any) -> Path:
-    """A room's TOML file whose listener takes any free port; return its path."""
-    keys = {"port": 0, "min_free_mib": 1, "prompt_delay_s": 0.5, **listener}
+    """A room's TOML file whose listener takes any free port; return its path.
+
+    Nothing is known there of the scanner's clock unless it is said.
+    """
+    keys = {"port": 0, "min_free_mib": 1, **listener}
     lines = [f"{key} = {json.dumps(value)}" for key, value in keys.items()]
     text = "\n".join(
         [

@@ -2,6 +2,7 @@
 
 import io
 import warnings
+from dataclasses import replace
 from datetime import UTC, datetime
 from zoneinfo import ZoneInfo
 
@@ -15,7 +16,17 @@ from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset
 from pydicom.sequence import Sequence
 
-from dicom_listener.clock import ClockRules, Drift, ScannerClock, Sync, observe
+from dicom_listener.clock import (
+    ClockRules,
+    Comparison,
+    Drift,
+    OffsetUnknown,
+    Promptness,
+    Received,
+    ScannerClock,
+    observe,
+)
+from dicom_listener.promptness import TooFewDelaysError, promptness_of
 from dicom_listener.scanner_clocks import ScannerClocks
 from dicom_slice.elements import Elements, frame_elements
 from dicom_slice.header import slices_of
@@ -216,7 +227,8 @@ def test_odd_values_are_read_with_a_warning_that_stays_with_the_slice():
 
 # Clocks
 
-RULES = ClockRules(prompt_delay_s=3.0, late_limit_s=120.0, jump_tolerance_s=0.5)
+RULES = ClockRules(late_limit_s=120.0, jump_tolerance_s=0.5)
+MEASURED = replace(RULES, promptness=Promptness(0.2, 3.0))
 
 
 def acquired(start_s: float, length_s: float | None = 2.0, estimated: bool = False):
@@ -224,62 +236,153 @@ def acquired(start_s: float, length_s: float | None = 2.0, estimated: bool = Fal
     return AcquisitionInterval(start_s, end_s, "AcquisitionDateTime", estimated)
 
 
-def after(clock: ScannerClock, *received: tuple[AcquisitionInterval, float]) -> ScannerClock:
-    for interval, received_s in received:
-        clock = observe(clock, interval, received_s, RULES).clock
+def after(clock: ScannerClock, *received: Received, rules: ClockRules = RULES) -> ScannerClock:
+    for slice_ in received:
+        clock = observe(clock, slice_, rules).clock
     return clock
+
+
+def compared(offset_s: float, uncertainty_s: float = 0.1, at_s: float = 1000.0) -> ScannerClock:
+    return ScannerClock().compared(Comparison(offset_s, uncertainty_s, at_s), RULES)
+
+
+def test_slices_alone_never_say_how_far_the_clocks_are_apart():
+    clock = after(ScannerClock(), *(Received(acquired(1000.0 + k), 1003.0 + k) for k in range(50)))
+    unknown = clock.bounds_for(Received(acquired(1100.0), 1103.0), RULES)
+    assert isinstance(unknown, OffsetUnknown)
+    assert unknown.text.startswith("the clocks have not been compared: compare the clocks, or conf")
 
 
 @given(
     offset_s=st.floats(-500, 500),
-    delays_s=st.lists(st.floats(0, 60), min_size=1, max_size=20),
-    prompt_at=st.integers(0, 19),
+    error_s=st.floats(-0.1, 0.1),
+    delays_s=st.lists(st.floats(0, 100), min_size=1, max_size=20),
 )
-def test_the_bounds_hold_the_true_offset_once_one_slice_was_prompt(offset_s, delays_s, prompt_at):
-    delays_s[prompt_at % len(delays_s)] = 1.0
+def test_after_a_comparison_no_delay_of_any_slice_takes_the_offset_out_of_its_bounds(
+    offset_s, error_s, delays_s
+):
+    clock = compared(offset_s + error_s)
+    for number, delay_s in enumerate(delays_s):
+        interval = acquired(1000.0 + 10 * number - offset_s)
+        slice_ = Received(interval, interval.end_s + offset_s + delay_s)
+        clock = after(clock, slice_)
+        if clock.suspicion:
+            return  # one that came much sooner than all the others: nothing is assigned
+        bounds = clock.bounds_for(slice_, RULES)
+        assert bounds.low_s - 1e-6 <= offset_s <= bounds.high_s + 1e-6
+
+
+@given(
+    offset_s=st.floats(-500, 500),
+    delays_s=st.lists(st.floats(0.2, 3.0), min_size=5, max_size=20),
+)
+def test_where_promptness_was_measured_slices_that_agree_bound_the_offset(offset_s, delays_s):
     clock = ScannerClock()
     for number, delay_s in enumerate(delays_s):
         interval = acquired(1e6 + 10 * number)
-        clock = after(clock, (interval, interval.end_s + offset_s + delay_s))
-    bounds = clock.bounds_for(interval, interval.end_s + offset_s + delays_s[-1], RULES)
-    assert bounds.low_s - 1e-6 <= offset_s <= bounds.high_s + 1e-6
-    assert bounds.high_s - bounds.low_s <= RULES.prompt_delay_s + 1e-6
+        slice_ = Received(interval, interval.end_s + offset_s + delay_s)
+        clock = after(clock, slice_, rules=MEASURED)
+    bounds = clock.bounds_for(slice_, MEASURED)
+    if isinstance(bounds, OffsetUnknown):  # only where one broke with a habit of the others
+        assert clock.suspicion
+    else:
+        assert bounds.low_s - 1e-6 <= offset_s <= bounds.high_s + 1e-6
+        assert bounds.high_s - bounds.low_s <= 3.0 + 1e-6
 
 
-def test_a_clock_set_forward_is_an_alarm_and_everything_known_is_dropped():
-    clock = after(ScannerClock(), (acquired(1000.0), 1003.0))
-    seen = observe(clock, acquired(1100.0 + 60.0), 1103.0, RULES)
-    assert "ahead" in seen.jump
-    bounds = seen.clock.bounds_for(acquired(1160.0), 1103.0, RULES)
-    assert bounds.high_s == pytest.approx(-59.0)
+def test_slices_that_were_held_up_do_not_agree_and_are_not_believed():
+    clock = ScannerClock()
+    for number, delay_s in enumerate((60.0, 20.0, 90.0, 45.0, 33.0, 71.0)):
+        slice_ = Received(acquired(1000.0 + 10 * number), 1002.0 + 10 * number + delay_s)
+        clock = after(clock, slice_, rules=MEASURED)
+    unknown = clock.bounds_for(slice_, MEASURED)
+    assert isinstance(unknown, OffsetUnknown)
+    assert "no 5 slices came as promptly as was measured at this site" in unknown.text
+
+
+def test_with_comparison_and_promptness_an_acquisition_must_be_good_by_both():
+    clock = compared(0.0)
+    at_once = Received(acquired(1010.0), 1012.0 + 0.5)
+    bounds = after(clock, at_once, rules=MEASURED).bounds_for(at_once, MEASURED)
+    assert bounds.low_s == pytest.approx(0.5 - 3.0)
+    held_up = Received(acquired(1010.0), 1012.0 + 50.0)
+    seen = observe(clock, held_up, MEASURED)
+    assert "no slice came later than 3.0 s when this was measured" in seen.unlike
+    assert seen.clock.bounds_for(held_up, MEASURED).low_s == pytest.approx(-0.1, abs=0.1)
+
+
+def test_a_clock_set_forward_stops_everything_until_the_clocks_are_compared():
+    clock = compared(0.0)
+    ahead = Received(acquired(1160.0), 1103.0)
+    seen = observe(clock, ahead, RULES)
+    assert "ahead of the comparison" in seen.jump
+    assert isinstance(
+        seen.clock.bounds_for(Received(acquired(1100.0), 1103.0), RULES), OffsetUnknown
+    )
+    assert seen.clock.comparisons == clock.comparisons  # the stronger knowledge is not dropped
+    again = seen.clock.compared(Comparison(-59.0, 0.1, 1110.0), RULES)
+    # what was on its way when the clock was set cannot be told from what is new
+    soon = again.bounds_for(Received(acquired(1172.0), 1115.0), RULES)
+    assert isinstance(soon, OffsetUnknown)
+    assert "before the scanner's clock was set" in soon.text
+    later = again.bounds_for(Received(acquired(1300.0), 1243.0), RULES)
+    assert later.low_s == pytest.approx(-59.1, abs=0.1)
+
+
+def test_comparisons_that_do_not_agree_say_that_the_clock_was_set_in_between():
+    clock = compared(0.0).compared(Comparison(60.0, 0.1, 1100.0), RULES)
+    assert clock.set_at_s == 1100.0
+    agreeing = compared(0.0).compared(Comparison(0.15, 0.1, 1100.0), RULES)
+    assert agreeing.set_at_s is None
+
+
+def test_a_slice_that_comes_much_sooner_than_all_before_it_is_suspicious():
+    clock = compared(0.0)
+    for number in range(6):
+        clock = after(clock, Received(acquired(1000.0 + 30 * number), 1022.0 + 30 * number))
+    sooner = Received(acquired(1300.0), 1317.0)
+    seen = observe(clock, sooner, RULES)
+    assert "5.0 s sooner after its acquisition than any of the 6 slices before it" in seen.jump
+    assert isinstance(seen.clock.bounds_for(sooner, RULES), OffsetUnknown)
+    agreed = seen.clock.compared(Comparison(0.0, 0.1, 1320.0), RULES)
+    assert agreed.bounds_for(sooner, RULES).low_s == pytest.approx(-0.1, abs=0.1)
 
 
 def test_a_clock_set_back_is_an_alarm_once_it_seems_too_late():
-    clock = after(ScannerClock(), (acquired(1000.0), 1003.0))
-    assert not observe(clock, acquired(1000.0), 1100.0, RULES).late
-    assert "set back" in observe(clock, acquired(1000.0), 1200.0, RULES).late
+    clock = after(compared(0.0), Received(acquired(1000.0), 1003.0))
+    assert not observe(clock, Received(acquired(1000.0), 1100.0), RULES).late
+    assert "set back" in observe(clock, Received(acquired(1000.0), 1200.0), RULES).late
 
 
-def test_a_clock_that_is_off_by_more_than_any_clock_is_not_believed():
-    old_slice = acquired(1000.0)
-    clock = after(ScannerClock(), (old_slice, 90_000.0))
-    assert clock.bounds_for(old_slice, 90_000.0, RULES) is None
-
-
-def test_a_sync_bounds_the_offset_before_any_slice_and_widens_with_age():
-    clock = ScannerClock(sync=Sync(40.0, 0.1, 0.0))
+def test_a_comparison_widens_with_age_and_ends():
+    clock = compared(40.0, at_s=0.0)
     interval = acquired(960.0, 2.0)
-    bounds = clock.bounds_for(interval, 1002.5, RULES)
-    assert bounds.high_s == pytest.approx(40.1 + 1002.5 * 50e-6)
-    assert bounds.low_s <= 39.9
+    bounds = clock.bounds_for(Received(interval, 1002.5), RULES)
+    assert bounds.low_s == pytest.approx(39.9 - 1002.5 * 500e-6)
+    disciplined = clock.bounds_for(Received(interval, 1002.5, synchronized=True), RULES)
+    assert disciplined.low_s == pytest.approx(39.9 - 1002.5 * 50e-6)
+    tomorrow = acquired(86360.0)
+    unknown = clock.bounds_for(Received(tomorrow, 86402.5), RULES)
+    assert isinstance(unknown, OffsetUnknown)
+    assert "compared 1440 min away" in unknown.text
+    known = clock.bounds_for(Received(tomorrow, 86402.5, synchronized=True), RULES)
+    assert known.low_s == pytest.approx(39.9 - 86402.5 * 50e-6)
 
 
-def test_a_slice_without_a_duration_bounds_the_offset_by_the_longest_acquisition():
-    interval = acquired(1000.0, None)
-    clock = after(ScannerClock(), (interval, 1005.0))
-    bounds = clock.bounds_for(interval, 1005.0, RULES)
-    assert bounds.high_s == pytest.approx(5.0)
-    assert bounds.low_s == pytest.approx(5.0 - RULES.longest_acquisition_s - RULES.prompt_delay_s)
+def test_a_slice_without_a_duration_may_have_lasted_as_long_as_any():
+    slice_ = Received(acquired(1000.0, None), 1005.0)
+    clock = after(compared(0.0), slice_, rules=MEASURED)
+    bounds = clock.bounds_for(slice_, MEASURED)
+    assert bounds.low_s == pytest.approx(5.0 - RULES.longest_acquisition_s - 3.0)
+
+
+def test_bounds_of_delays_come_from_enough_of_them():
+    delays_s = [5.0 + 0.1 * (k % 5) for k in range(20)]
+    measured = promptness_of(delays_s)
+    assert measured.least_s == pytest.approx(4.7)
+    assert measured.most_s == pytest.approx(5.7)
+    with pytest.raises(TooFewDelaysError, match="19 delays; at least 20"):
+        promptness_of(delays_s[1:])
 
 
 def kinds_of_a_session(drift_per_slice_s: float, n_slices: int = 60) -> list[str]:
@@ -308,6 +411,6 @@ def test_a_clock_as_good_as_clocks_are_is_no_alarm(drift_per_slice_s):
 def test_only_certain_ends_count_for_a_drift():
     drift = Drift()
     for number in range(20):
-        drift = drift.with_slice(acquired(1000.0 + number), 1003.0 + 2 * number)
+        drift = drift.with_slice(Received(acquired(1000.0 + number), 1003.0 + 2 * number))
     assert drift.moved_s == pytest.approx(10.0)
-    assert drift.with_slice(acquired(1000.0, None), 2000.0) == drift  # an end that is not certain
+    assert drift.with_slice(Received(acquired(1000.0, None), 2000.0)) == drift

@@ -13,7 +13,7 @@ from pydicom.sequence import Sequence
 from real_slices import DICOM
 
 from case_record.record import CaseRecord
-from dicom_listener.clock import ClockRules
+from dicom_listener.clock import Comparison
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope, sha256_of
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
@@ -27,7 +27,7 @@ class Desk:
     """A record, an inbox and an intake in one folder."""
 
     def __init__(self, folder: Path, **rules) -> None:
-        rules.setdefault("clock", ClockRules(prompt_delay_s=0.5))
+        rules.setdefault("comparison", Comparison(0.0, 0.1, time.time()))
         self.record = CaseRecord(folder / "case", create=True)
         self.inbox = Inbox(folder / "case" / "inbox")
         self.folder = folder
@@ -136,8 +136,8 @@ def test_a_slice_without_any_uid_still_has_a_row(make_desk):
     assert row.sop_instance_uid.startswith("none-")
 
 
-def test_an_explicit_sync_replaces_what_was_known_of_the_clock(make_desk):
-    desk = make_desk()
+def test_a_comparison_of_the_clocks_releases_the_slice_that_waits_for_it(make_desk):
+    desk = make_desk(comparison=None)
     begin_hold(desk.record, time.time() - 60, expected=9)
     hour_off = mr_data_set("1.2.1", began_s=time.time() - 3600.6)
     assert desk.receive(hour_off)[0].reason_code == "clock_unknown"
@@ -146,6 +146,7 @@ def test_an_explicit_sync_replaces_what_was_known_of_the_clock(make_desk):
     desk.intake.look_at_record()
     again = mr_data_set("1.2.2", began_s=time.time() - 3600.6)
     assert desk.receive(again)[0].state == "assigned"
+    assert desk.record.slices()[0].state == "assigned"
 
 
 def test_set_aside_files_are_removed_after_their_retention_and_used_ones_never(make_desk):
@@ -254,15 +255,13 @@ def test_giving_up_a_complete_hold_changes_nothing(make_desk):
     assert desk.record.hold(hold_id).expected_slices == 1
 
 
-def test_what_was_learnt_of_a_clock_after_its_reset_outlives_a_restart(make_desk):
-    """Slices and resets are replayed in the order in which they came."""
+def test_a_clock_that_was_set_is_not_known_again_by_a_restart(make_desk):
+    """Slices, comparisons and resets are replayed in the order in which they came."""
     desk = make_desk()
     begin_hold(desk.record, time.time() - 60, expected=9)
-    desk.receive(mr_data_set("1.2.1", began_s=time.time() - 500.6))
+    assert desk.receive(mr_data_set("1.2.1", began_s=time.time() - 0.6))[0].state == "assigned"
     reset_clock(desk.record, "anna", "it had been set")
-    (taken,) = desk.receive(mr_data_set("1.2.2", began_s=time.time() - 0.6))
-    assert taken.state == "assigned"
-    again = make_desk()
-    late = mr_data_set("1.2.3", began_s=time.time() - 200.6)
-    (row,) = again.receive(late)
-    assert row.reason_code == "late_or_clock_jump"  # by the slice that came after the reset
+    for number, room in enumerate((desk, make_desk()), start=2):
+        (row,) = room.receive(mr_data_set(f"1.2.{number}", began_s=time.time() - 0.6))
+        assert (row.state, row.reason_code) == ("pending", "clock_unknown")
+        assert "before the scanner's clock was set" in row.reason

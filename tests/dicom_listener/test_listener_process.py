@@ -12,10 +12,12 @@ import sys
 import threading
 import time
 import urllib.request
+from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
 from listener_room import (
+    COMPARED,
     ListenerProcess,
     begin_hold,
     listening,
@@ -29,7 +31,7 @@ from pynetdicom.association import Association
 
 from case_record.record import CaseRecord
 from dicom_listener.inbox import is_whole, read_envelope
-from dicom_listener.overrule import reassign, reset_clock
+from dicom_listener.overrule import reassign, sync_clock
 from dicom_listener.process import run
 from dicom_listener.requestor import mended
 from dicom_listener.slice_rows import slice_from_record
@@ -43,7 +45,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture
 def config(tmp_path):
-    return write_room(tmp_path)
+    return write_room(tmp_path, **COMPARED)
 
 
 @pytest.fixture
@@ -151,18 +153,25 @@ def test_an_operator_may_overrule_and_who_is_recorded(config, record):
         assert rows(record, 2)[1].reason_code == "not_expected"
 
 
-def test_a_scanner_clock_set_forward_is_an_alarm(config, record):
+def test_a_scanner_clock_set_forward_stops_assignment_until_the_clocks_are_compared(config, record):
     begin_hold(record, time.time() - 100.0, expected=9)
     with listening(config) as listener:
         send(listener.port, mr_data_set("1.2.1", began_s=time.time() - 40.6))
         assert rows(record, 1)[0].state == "assigned"
-        send(listener.port, mr_data_set("1.2.2", began_s=time.time() - 0.6))
-        rows(record, 2)
-        wait_for(lambda: alarms(record) == ["clock_jump"])
+        send(listener.port, mr_data_set("1.2.2", began_s=time.time() + 30.0))
+        assert rows(record, 2)[1].reason_code == "clock_unknown"
+        assert alarms(record) == ["clock_jump"]
+        # what was known is not replaced by what contradicts it
+        send(listener.port, mr_data_set("1.2.3", began_s=time.time() + 29.4))
+        waiting = rows(record, 3)[2]
+        assert (waiting.state, waiting.reason_code) == ("pending", "clock_unknown")
+        assert "ahead of the comparison: compare the clocks, or confirm" in waiting.reason
+        sync_clock(record, -30.0, 0.1, "anna")
+        wait_for(lambda: "before the scanner's clock was set" in record.slices()[2].reason)
 
 
-def test_a_scanner_clock_set_back_stops_assignment_until_it_is_reset(tmp_path):
-    config = write_room(tmp_path, late_limit_s=30.0)
+def test_a_slice_that_seems_minutes_late_is_set_aside_with_an_alarm(tmp_path):
+    config = write_room(tmp_path, late_limit_s=30.0, **COMPARED)
     with CaseRecord(tmp_path / "case", create=True) as record, listening(config) as listener:
         begin_hold(record, time.time() - 5.0, expected=9)
         send(listener.port, mr_data_set("1.2.1", began_s=time.time() - 0.6))
@@ -170,9 +179,74 @@ def test_a_scanner_clock_set_back_stops_assignment_until_it_is_reset(tmp_path):
         send(listener.port, mr_data_set("1.2.2", began_s=time.time() - 60.6))
         assert rows(record, 2)[1].reason_code == "late_or_clock_jump"
         assert alarms(record) == ["late_or_clock_jump"]
-        reset_clock(record, "anna")
-        send(listener.port, mr_data_set("1.2.3", began_s=time.time() - 60.6))
-        assert rows(record, 3)[2].state == "assigned"
+
+
+@pytest.mark.parametrize("keys", [{}, {"prompt_delay_s": 3.0}], ids=["nothing known", "promptness"])
+def test_a_slice_of_before_the_hold_that_is_pushed_late_waits_for_the_clocks_to_be_compared(
+    tmp_path, keys
+):
+    """Equal clocks, and nothing that shows it: acquired before the robot stood, pushed after."""
+    config = write_room(tmp_path, **keys)
+    with CaseRecord(tmp_path / "case", create=True) as record, listening(config) as listener:
+        settled_s = time.time() - 20.0
+        hold_id = begin_hold(record, settled_s, expected=9)
+        send(listener.port, mr_data_set("1.2.1", began_s=settled_s - 6.0))
+        (row,) = rows(record, 1)
+        assert (row.state, row.reason_code) == ("pending", "clock_unknown")
+        assert "compare the clocks, or confirm at which hold" in row.reason
+        good = mr_data_set("1.2.2", began_s=settled_s + 2.0)
+        good.AcquisitionNumber = 2
+        send(listener.port, good)
+        assert rows(record, 2)[1].reason_code == "clock_unknown"
+        sync_clock(record, 0.0, 0.5, "anna")
+        wait_for(lambda: [r.state for r in record.slices()] == ["quarantined", "assigned"])
+        early, late = record.slices()
+        assert early.reason_code in ("outside_hold", "no_open_hold")
+        assert "before" in early.reason
+        assert late.hold_id == hold_id
+
+
+@pytest.mark.parametrize(("early_s", "late_s"), [(2.0, 6.0), (4.0, 8.0), (10.0, 20.0)])
+def test_after_a_comparison_no_earlier_slice_says_how_late_this_one_is(tmp_path, early_s, late_s):
+    config = write_room(tmp_path, clock_offset_s=0.0, clock_uncertainty_s=1.0)
+    with CaseRecord(tmp_path / "case", create=True) as record, listening(config) as listener:
+        settled_s = time.time() - late_s
+        send(listener.port, mr_data_set("1.2.1", began_s=settled_s - 60.0))
+        rows(record, 1)
+        begin_hold(record, settled_s, expected=9)
+        early = mr_data_set("1.2.2", began_s=settled_s - early_s)
+        good = mr_data_set("1.2.3", began_s=settled_s + 2.0)
+        early.AcquisitionNumber, good.AcquisitionNumber = 2, 3
+        send(listener.port, early, good)
+        assert [row.state for row in rows(record, 3)][1:] == ["quarantined", "assigned"]
+
+
+def test_a_comparison_from_long_ago_holds_no_more_unless_the_scanner_is_synchronized(tmp_path):
+    hours_ago = datetime.fromtimestamp(time.time() - 7200, UTC).isoformat()
+    config = write_room(tmp_path, **COMPARED, clock_compared_at=hours_ago)
+    with CaseRecord(tmp_path / "case", create=True) as record, listening(config) as listener:
+        begin_hold(record, time.time() - 20.0, expected=9)
+        send(listener.port, mr_data_set("1.2.1", began_s=time.time() - 0.6))
+        assert "compared 120 min away" in rows(record, 1)[0].reason
+        disciplined = mr_data_set("1.2.2", began_s=time.time() - 0.6)
+        disciplined.AcquisitionTimeSynchronized = "Y"
+        send(listener.port, disciplined)
+        assert rows(record, 2)[1].state == "assigned"
+
+
+def test_after_the_clock_was_set_what_was_acquired_before_may_not_be_told_from_what_is_new(
+    config, record
+):
+    """The clock goes back by 60 s, somebody compares: a slice of before looks a minute later."""
+    settled_s = time.time() - 25.0
+    begin_hold(record, settled_s, expected=9)
+    with listening(config) as listener:
+        sync_clock(record, 60.0, 0.1, "anna")
+        of_before = mr_data_set("1.2.1", began_s=settled_s - 50.0)
+        new = mr_data_set("1.2.2", began_s=time.time() - 60.6)
+        new.AcquisitionNumber = 2
+        send(listener.port, of_before, new)
+        assert {row.state for row in rows(record, 2)} == {"pending"}
 
 
 def test_in_arrival_mode_a_confirmed_acquisition_needs_no_time(tmp_path):

@@ -14,7 +14,7 @@ from listener_room import begin_hold, mr_data_set
 from pydicom.dataset import Dataset
 
 from case_record.record import CaseRecord
-from dicom_listener.clock import ClockRules
+from dicom_listener.clock import ClockRules, Promptness
 from dicom_listener.inbox import Envelope, Inbox, sha256_of
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
@@ -82,7 +82,7 @@ class Desk:
     def start(self) -> None:
         self.record = CaseRecord(self.folder / "case")
         self.inbox = Inbox(self.folder / "case" / "inbox")
-        rules = IntakeRules(clock=ClockRules(prompt_delay_s=1.0))
+        rules = IntakeRules(clock=ClockRules(Promptness(0.0, 1.0), witnesses=2))
         self.intake = Intake(self.record, self.inbox, rules, ListenerMetrics())
 
     def end(self) -> None:

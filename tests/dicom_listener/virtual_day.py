@@ -1,45 +1,73 @@
 """A room in which everything goes wrong at once, with the truth known: for assignment alone.
 
-Discrete events on our clock. A scanner acquires when asked, and when not; its clock is off, drifts
-and jumps; slices come late, swapped, or never; the robot moves on when its slices are there, or
-when its patience ends. Every assignment is checked against the true interval of the acquisition.
+Discrete events on our clock. Slices take as long to come as at some site: at once or after two
+minutes, regularly or not, one by one or a series at its end. Operators start before the robot
+stands. The scanner's clock is off, creeps and is set. The robot moves on when its slices are there,
+or when its patience ends. No day begins with a slice that would show anything. Every assignment is
+checked against the true interval of the acquisition.
 """
 
 import heapq
+import math
 import random
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
 from listener_room import a_slice
 
 from dicom_listener.assign import Assigned, AssignRules, HoldWindow, Known, Pending, assign
-from dicom_listener.clock import ClockRules, OffsetBounds, ScannerClock, Sync, observe
+from dicom_listener.clock import (
+    ClockRules,
+    Comparison,
+    Offset,
+    OffsetUnknown,
+    Promptness,
+    Received,
+    ScannerClock,
+    observe,
+)
+from dicom_listener.promptness import FEWEST_DELAYS, promptness_of
 from dicom_slice.header import Slice
 from dicom_slice.times import AcquisitionInterval
+
+_LONGEST_DELAY_S = 300.0
+DELAYS = ("regular", "varied", "any", "series")
+KNOWLEDGE = ("comparison", "promptness", "both", "neither")
 
 
 @dataclass(frozen=True)
 class Trouble:
     """How much of what goes wrong.
 
-    late_after_jump: slices may be late although the clock has just jumped and no prompt slice has
-    shown it. Nothing in a slice tells such a pair of faults from a good slice where they cancel.
+    held_up: a slice comes up to two minutes later than is usual at this site.
+    early: the operator starts before the robot stands.
+    steps: how often the scanner's clock is set, forward or back.
+    unseen_steps: with nothing but a comparison, the clock may go forward by less than a slice takes
+    to come. Nothing in a slice tells that from one that came sooner; only what was measured of the
+    site does, or another comparison. Without it, such a step is longer than any slice takes.
     """
 
+    knowledge: str = "comparison"
+    delays: str = "regular"
     loss: float = 0.0
-    late: float = 0.0
+    held_up: float = 0.0
+    early: float = 0.0
     extra_scans: float = 0.0
-    jumps: int = 0
+    steps: int = 0
+    creep_ppm: float = 20.0
     impatience: float = 0.0
     unnumbered: bool = False
     no_duration: float = 0.0
     estimated: float = 0.0
-    synced: bool = True
-    late_after_jump: bool = False
+    unseen_steps: bool = False
 
 
 @dataclass
 class Outcome:
+    """good: slices that were acquired wholly at a standing hold which lacked one."""
+
     assigned: int = 0
+    good: int = 0
     set_aside: dict[str, int] = field(default_factory=dict)
     wrong: list[str] = field(default_factory=list)
 
@@ -52,46 +80,63 @@ class Arrival:
     slice: Slice
 
 
+def delays_of_site(dice: random.Random, kind: str) -> Callable[[], float]:
+    """How long a slice takes to come there, as a function to be asked for each slice."""
+    usual_s = 0.2 * 600 ** dice.random()  # 0.2 to 120 s
+    if kind == "regular":
+        spread_s = min(usual_s, dice.uniform(0.05, 2.0))
+        return lambda: usual_s + dice.uniform(-0.5, 0.5) * spread_s
+    if kind == "varied":
+        return lambda: usual_s * dice.uniform(0.5, 1.5)
+    return lambda: 0.2 * 600 ** dice.random()
+
+
 class VirtualDay:
     """One case of some holds. `run` returns what was assigned, and what wrongly."""
 
-    prompt_s = 2.0
-
-    def __init__(self, dice: random.Random, trouble: Trouble, *, ask_after_s: float = 0.0) -> None:
+    def __init__(self, dice: random.Random, trouble: Trouble) -> None:
         self.dice, self.trouble = dice, trouble
-        self.ask_after_s = ask_after_s  # how long the robot stands before slices are asked for
+        self.delay_s = delays_of_site(dice, trouble.delays)
         self.rules = AssignRules(guard_s=0.05, late_limit_s=120.0)
-        self.clock_rules = ClockRules(prompt_delay_s=self.prompt_s, late_limit_s=120.0)
+        promptness = None
+        if trouble.knowledge in ("promptness", "both"):
+            promptness = self.commissioned()
+        self.clock_rules = ClockRules(promptness=promptness, late_limit_s=120.0)
         self.offset_s = dice.uniform(-300, 300)  # our clock - the scanner's
         self.first_offset_s = self.offset_s
-        self.drift = dice.uniform(-20e-6, 20e-6)
-        self.jumped_s: float | None = None  # a jump that no prompt slice has shown yet
+        self.creep = dice.uniform(-1, 1) * trouble.creep_ppm * 1e-6
         self.number = 0
         self.uid = 0
         self.holds: list[HoldWindow] = []
-        self.known: list[Known] = []
+        self.known: dict[int, Known] = {}
+        self.waiting: dict[int, tuple[int, Arrival]] = {}
         self.outcome = Outcome()
         self.arrivals: list[tuple[float, int, Arrival]] = []
-        self.jumps = sorted(dice.uniform(0, 300) for _ in range(trouble.jumps))
-        sync = None
-        if trouble.synced:
-            error_s = dice.uniform(-0.2, 0.2)
-            sync = Sync(self.offset_s + error_s, 0.25, 0.0)
-        self.clock = ScannerClock(sync=sync)
+        self.series: list[Arrival] = []
+        self.step_times = sorted(dice.uniform(0, 300) for _ in range(trouble.steps))
+        self.steps: list[tuple[float, float]] = []
+        self.clock = ScannerClock()
+
+    def commissioned(self) -> Promptness:
+        return promptness_of([self.delay_s() for _ in range(FEWEST_DELAYS)])
 
     def run(self, n_holds: int) -> Outcome:
         now_s = 0.0
-        self.warm_up()
+        if self.trouble.knowledge in ("comparison", "both"):
+            self.compare(now_s)
         for place in range(n_holds):
             now_s += self.dice.uniform(0.3, 8.0)  # the robot moves
             now_s = self.stand(now_s, place)
         self.receive_until(now_s + 500, None)
         return self.outcome
 
-    def warm_up(self) -> None:
-        """A localizer comes promptly before anything else: it shows how late the clock is."""
-        scan = self.scan(-10.0, 1.0)
-        self.receive(replace(scan, received_s=-9.0 + self.dice.uniform(0.0, self.prompt_s)))
+    def compare(self, now_s: float) -> None:
+        """Somebody reads the scanner's clock, to 0.2 s, and says that it is 0.25 s."""
+        offset_s = now_s - self.scanner_s(now_s) + self.dice.uniform(-0.2, 0.2)
+        self.clock = self.clock.compared(Comparison(offset_s, 0.25, now_s), self.clock_rules)
+        for key in list(self.waiting):
+            number, arrival = self.waiting.pop(key)
+            self.decide(arrival, number)
 
     def stand(self, settled_s: float, place: int) -> float:
         """One hold: scans are asked for until all slices are there or patience ends."""
@@ -99,40 +144,57 @@ class VirtualDay:
         hold = HoldWindow(place + 1, place // 3, settled_s, None, wanted)
         self.holds.append(hold)
         now_s = settled_s
-        patience_s = self.dice.expovariate(1 / 30) + 0.5 if self.chance("impatience") else 400.0
+        patience_s = self.dice.expovariate(1 / 30) + 0.5 if self.chance("impatience") else 600.0
         deadline_s = settled_s + patience_s
         while now_s < deadline_s and self.count(hold) < wanted:
             now_s = self.scan_some(now_s, wanted - self.count(hold))
-            wait_s = self.dice.uniform(0.5, 15.0)
+            wait_s = self.dice.uniform(0.5, 15.0) + self.delay_s() * self.dice.choice((0, 1))
             now_s = self.receive_until(min(now_s + wait_s, deadline_s), (hold, wanted))
+            self.heed_page(now_s)
         now_s = max(now_s, settled_s + 0.01)
         self.holds[-1] = replace(hold, ended_at_s=now_s)
         if self.chance("extra_scans"):  # somebody scans while the robot moves
             self.send(self.scan(now_s + self.dice.uniform(-3.0, 3.0), self.dice.uniform(0.1, 3.0)))
+            self.push_series()
         return now_s
 
+    def heed_page(self, now_s: float) -> None:
+        """Who is asked to compare the clocks sometimes does; not in a room that never does."""
+        told = self.clock.contradicted or self.clock.suspicion or self.waiting
+        if told and self.trouble.knowledge != "neither" and self.dice.random() < 0.5:
+            self.compare(now_s)
+
     def scan_some(self, now_s: float, count: int) -> float:
-        began_s = now_s + self.ask_after_s
-        began_s += self.dice.uniform(-0.3 if self.chance("extra_scans") else 0.0, 3.0)
+        early_s = self.dice.choice((0.3, 3.0, 20.0)) if self.chance("early") else 0.0
+        began_s = now_s + self.dice.uniform(-early_s, 3.0)
         for _ in range(count):
             length_s = self.dice.uniform(0.1, 8.0)
             self.send(self.scan(began_s, length_s))
             began_s += length_s + self.dice.uniform(0.0, 0.5)
-        return began_s
+        self.push_series()
+        return max(now_s, began_s)
 
     def chance(self, name: str) -> bool:
         return self.dice.random() < getattr(self.trouble, name)
 
     def count(self, hold: HoldWindow) -> int:
-        return sum(known.hold_id == hold.hold_id for known in self.known)
+        return sum(known.hold_id == hold.hold_id for known in self.known.values())
 
     def scanner_s(self, our_s: float) -> float:
-        while self.jumps and self.jumps[0] <= our_s:
-            self.jumps.pop(0)
-            size_s = self.dice.choice((0.3, 1.0, 5.0, 20.0, 60.0, 3600.0)) * self.dice.random()
-            self.offset_s += self.dice.choice((-1, 1)) * size_s
-            self.jumped_s = our_s
-        return our_s - self.offset_s - self.drift * our_s
+        while self.step_times and self.step_times[0] <= our_s:
+            at_s = self.step_times.pop(0)
+            self.steps.append((at_s, self.step_s()))
+        offset_s = self.offset_s + sum(size for at_s, size in self.steps if at_s <= our_s)
+        return our_s - offset_s - self.creep * our_s
+
+    def step_s(self) -> float:
+        """By how much the offset changes: less than 0 where the scanner's clock goes forward."""
+        size_s = self.dice.choice((0.3, 1.0, 5.0, 20.0, 60.0, 3600.0)) * self.dice.random()
+        if self.dice.random() < 0.5:
+            return size_s
+        if self.clock_rules.promptness is None and not self.trouble.unseen_steps:
+            return -(_LONGEST_DELAY_S + size_s)
+        return -size_s
 
     def scan(self, began_s: float, length_s: float) -> Arrival:
         self.number += 1
@@ -149,16 +211,24 @@ class VirtualDay:
             interval=AcquisitionInterval(from_s, end_s, "AcquisitionDateTime", estimated),
             acquisition_number=1 if self.trouble.unnumbered else self.number,
         )
-        return Arrival(began_s, began_s + length_s, began_s + length_s, slice_)
+        return Arrival(began_s, began_s + length_s, math.nan, slice_)
 
     def send(self, scan: Arrival) -> None:
         if self.chance("loss"):
             return
-        delay_s = self.dice.uniform(0.0, self.prompt_s)
-        if self.chance("late") and (self.jumped_s is None or self.trouble.late_after_jump):
-            delay_s = self.dice.uniform(0.0, self.dice.choice((5.0, 30.0, 100.0, 400.0)))
-        arrival = replace(scan, received_s=scan.true_to_s + delay_s)
-        heapq.heappush(self.arrivals, (arrival.received_s, self.uid, arrival))
+        self.series.append(scan)
+
+    def push_series(self) -> None:
+        """One by one as they are acquired, or all of them when the last one is."""
+        last_s = max((scan.true_to_s for scan in self.series), default=0.0)
+        for scan in self.series:
+            ready_s = last_s if self.trouble.delays == "series" else scan.true_to_s
+            received_s = ready_s + self.delay_s()
+            if self.chance("held_up"):
+                received_s += self.dice.uniform(0.0, 120.0)
+            arrival = replace(scan, received_s=received_s)
+            heapq.heappush(self.arrivals, (received_s, len(self.arrivals) + self.uid, arrival))
+        self.series.clear()
 
     def receive_until(self, limit_s: float, wanted: tuple[HoldWindow, int] | None) -> float:
         """Take what arrives; return when: at the limit, or as soon as the hold has its slices."""
@@ -170,31 +240,48 @@ class VirtualDay:
         return limit_s
 
     def receive(self, arrival: Arrival) -> None:
-        slice_ = arrival.slice
-        is_prompt = arrival.received_s - arrival.true_to_s <= self.prompt_s
-        if self.jumped_s is not None and is_prompt and arrival.true_from_s >= self.jumped_s:
-            self.jumped_s = None
-        assert slice_.interval is not None
-        seen = observe(self.clock, slice_.interval, arrival.received_s, self.clock_rules)
-        self.clock = seen.clock
+        self.outcome.good += self.is_good(arrival)
+        before = self.clock
+        self.clock = observe(before, self.received(arrival), self.clock_rules).clock
+        self.decide(arrival, len(self.known))
+        rules = self.clock_rules
+        if self.clock.is_witnessed(rules) and not before.is_witnessed(rules):
+            for key in list(self.waiting):
+                number, waited = self.waiting.pop(key)
+                self.decide(waited, number)
+
+    def received(self, arrival: Arrival) -> Received:
+        assert arrival.slice.interval is not None
+        return Received(arrival.slice.interval, arrival.received_s)
+
+    def decide(self, arrival: Arrival, number: int) -> None:
+        known = [k for key, k in self.known.items() if key < number or k.hold_id is not None]
         bounds = self.bounds_of(arrival)
-        holds = self.holds
-        decision = assign(slice_, arrival.received_s, holds, self.known, bounds, self.rules)
+        decision = assign(arrival.slice, arrival.received_s, self.holds, known, bounds, self.rules)
         hold_id, code = None, ""
         if isinstance(decision, Assigned):
             hold_id = decision.hold_id
             self.check(arrival, hold_id)
         else:
             code = str(decision.code)
+            assert decision.text
+            if isinstance(decision, Pending) and isinstance(bounds, OffsetUnknown):
+                self.waiting[number] = number, arrival
             where = self.outcome.set_aside
             where[code] = where.get(code, 0) + 1
-            assert decision.text
-            assert not isinstance(decision, Pending) or decision.code
-        self.known.append(Known(slice_, arrival.received_s, hold_id, code))
+        self.known[number] = Known(arrival.slice, arrival.received_s, hold_id, code)
 
-    def bounds_of(self, arrival: Arrival) -> OffsetBounds | None:
-        assert arrival.slice.interval is not None
-        return self.clock.bounds_for(arrival.slice.interval, arrival.received_s, self.clock_rules)
+    def bounds_of(self, arrival: Arrival) -> Offset:
+        return self.clock.bounds_for(self.received(arrival), self.clock_rules)
+
+    def is_good(self, arrival: Arrival) -> bool:
+        """Acquired at the standing hold, which lacked it, and here before the robot went on."""
+        hold = self.holds[-1]
+        return (
+            hold.ended_at_s is None
+            and arrival.true_from_s >= hold.settled_at_s
+            and self.count(hold) < hold.expected_slices
+        )
 
     def check(self, arrival: Arrival, hold_id: int) -> None:
         self.outcome.assigned += 1

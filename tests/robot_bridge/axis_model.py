@@ -1,6 +1,6 @@
 """Motors in any time: four axes that run at constant speed. The truth of a campaign lives here."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 
 from robot_bridge.daemon.motors import MotorError, MotorStatus
@@ -69,7 +69,7 @@ class ModelMotors:
         self.stop_fails = 0
         self._moving = False
         self._reached = False
-        self._certain = False
+        self._certain: set[str] = set()
         self._homing = False
 
     def open(self) -> MotorStatus:
@@ -81,20 +81,21 @@ class ModelMotors:
         self.stage.run(setpoints_um)
         self._moving, self._reached = True, False
 
-    def home(self) -> None:
+    def home(self, axes: Collection[str] = ()) -> None:
         self.stage.run(dict.fromkeys(AXES, 0), homing=True)
         self._moving, self._reached, self._homing = True, False, True
 
     def poll(self) -> MotorStatus:
         if self._moving and not self.stage.moving:
             self._moving, self._reached = False, True
-            self._certain = self._certain or self._homing
+            if self._homing:
+                self._certain |= set(AXES)
             self._homing = False
         return MotorStatus(
             moving=self._moving,
             reached=self._reached,
             readback_um=self.stage.positions_um(),
-            certain=self._certain,
+            certain_axes=frozenset(self._certain),
             parked=self.stage.parked,
             fault=self.fault,
             fault_text=f"axis xt: {self.fault}" if self.fault else "",
@@ -111,8 +112,9 @@ class ModelMotors:
         self.stage.parked = True
 
     def declare_position(self, positions_um: Mapping[str, int]) -> None:
-        self.stage.from_um = self.stage.to_um = dict(positions_um)
-        self._certain = True
+        now_um = {**self.stage.positions_um(), **positions_um}
+        self.stage.from_um = self.stage.to_um = now_um
+        self._certain |= set(positions_um)
 
     def close(self) -> None:
         pass

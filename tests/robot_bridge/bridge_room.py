@@ -81,6 +81,10 @@ class EmulatedControllers:
     def moving(self) -> bool:
         return any(controller.moving for controller in self.all)
 
+    def on_a_long_way(self) -> bool:
+        """All axes are past the short run in which an encoder is tried first."""
+        return self.moving and min(map(abs, self.positions_um().values())) > 450
+
     def positions_um(self) -> dict[str, float]:
         return {name: stage.position_um for name, stage in self.stages.items()}
 

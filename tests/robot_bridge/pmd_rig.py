@@ -58,6 +58,20 @@ class Rig:
                     self.server.serve(ready)
 
 
+class StageWithEnds(IdealStage):
+    """Hard stops at both ends; `ground_um` is what was driven against them."""
+
+    ends_um = (-21_000.0, 21_000.0)
+    ground_um = 0.0
+
+    def drive(self, microsteps: int, frequency_hz: float) -> None:
+        super().drive(microsteps, frequency_hz)
+        low_um, high_um = self.ends_um
+        inside_um = min(max(self._position_um, low_um), high_um)
+        self.ground_um += abs(self._position_um - inside_um)
+        self._position_um = inside_um
+
+
 @contextlib.contextmanager
 def rig(
     addresses: tuple[int, ...] = (1, 2),
@@ -124,7 +138,11 @@ def opened(made: Rig, drive: str = "open_loop", declare: bool = True, **changes:
 
     drive "mixed": xt in open loop, yt in closed loop.
     """
-    options = {k: changes.pop(k) for k in ("park_after_move", "capture_file") if k in changes}
+    options = {
+        k: changes.pop(k)
+        for k in ("park_after_move", "capture_file", "response_delay_us")
+        if k in changes
+    }
     drives = ("open_loop", "closed_loop") if drive == "mixed" else (drive, drive)
     axes = [
         axis_config(name, made.url, address, drives[address - 1], **changes)

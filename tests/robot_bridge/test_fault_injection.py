@@ -57,7 +57,7 @@ def test_on_one_pair_of_wires_with_collisions_and_echoes_it_still_works(tmp_path
     assert findings.states["DONE"] > 200, findings
     room = campaign.room
     assert room.to_bridge.collisions + room.to_service.collisions > 0
-    assert campaign.client.counters.own_echoes > 100
+    assert campaign.client.counters.own_echoes > 0
     room.close()
 
 

@@ -268,8 +268,7 @@ def test_h13_stop_works_without_a_session_and_from_another_program(shared_room: 
     client = room.ready_client()
     thread = threading.Thread(target=_move_until_stopped, args=(room, client), daemon=True)
     thread.start()
-    wait_for(lambda: room.controllers.moving, 60, "the motors to turn")
-    time.sleep(0.1)
+    wait_for(room.controllers.on_a_long_way, 60, "the motors to turn")
     line = os.open(room.line.far, os.O_RDWR | os.O_NOCTTY)
     os.write(line, framing.encode_stop(1, False))  # thirteen bytes, no session
     os.close(line)
@@ -290,7 +289,7 @@ def test_h13_stop_overtakes_a_flood_of_other_frames(shared_room: BridgeRoom):
     raw = RawService(room)
     raw.say_hello()
     assert raw.move(room.id("long"), FAR, raw.make_ready()).state == "ACCEPTED"
-    wait_for(lambda: room.controllers.moving, 60, "the motors to turn")
+    wait_for(room.controllers.on_a_long_way, 60, "the motors to turn")
     flood = b"".join(framing.encode(Frame(0x13, raw.session, 100 + n, b"\x80")) for n in range(60))
     raw.line.write(flood + framing.encode_stop(2, False))
     wait_for(lambda: not room.controllers.moving, 0.5, "standstill")
@@ -303,8 +302,7 @@ def test_h13_stop_works_while_the_controllers_answer_nothing(shared_room: Bridge
     client = room.ready_client()
     thread = threading.Thread(target=_move_until_stopped, args=(room, client), daemon=True)
     thread.start()
-    wait_for(lambda: room.controllers.moving, 60, "the motors to turn")
-    time.sleep(0.1)
+    wait_for(room.controllers.on_a_long_way, 60, "the motors to turn")
     room.controllers.bus.faults.drop_probability = 1.0
     client.request_stop()
     wait_for(lambda: not room.controllers.moving, 0.5, "standstill")

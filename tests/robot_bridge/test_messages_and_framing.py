@@ -42,9 +42,10 @@ VALUES = {
     str: TEXT,
     str | None: st.none() | TEXT,
     dict[str, int]: POSITIONS,
-    tuple[AxisTravel, ...]: st.lists(st.builds(AxisTravel, TEXT, INTEGER, INTEGER), max_size=5).map(
-        tuple
-    ),
+    tuple[str, ...]: st.lists(TEXT, max_size=5).map(tuple),
+    tuple[AxisTravel, ...]: st.lists(
+        st.builds(AxisTravel, TEXT, INTEGER, INTEGER, INTEGER), max_size=5
+    ).map(tuple),
 }
 
 

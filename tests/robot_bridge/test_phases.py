@@ -7,7 +7,7 @@ what each request needs. Whatever is not allowed must change nothing and move no
 import contextlib
 import itertools
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import pytest
@@ -20,6 +20,7 @@ from robot_bridge.protocol.messages import (
     Arm,
     Code,
     CommandState,
+    CorrectPosition,
     DeclarePosition,
     Disarm,
     HelloRequest,
@@ -293,6 +294,16 @@ def test_a_position_is_declared_only_at_standstill(folder: Path):
             assert not bench.began_something
 
 
+def test_a_position_is_corrected_only_at_standstill_and_moves_nothing(folder: Path):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            correction = CorrectPosition({"xt": 700}, {"xt": 50}, bench.before.last_motion, 0)
+            answer = bench.ask(replace(correction, seen_ms=bench.now_ms))
+            assert (answer.code == Code.OK) == (not case.moving)
+            assert bench.bridge.certain == case.certain
+            assert not bench.began_something
+
+
 @pytest.mark.parametrize("emergency", [False, True])
 def test_stop_works_in_every_standing(folder: Path, emergency: bool):
     for case in CASES:
@@ -341,6 +352,7 @@ def test_requests_sent_too_long_ago_are_refused_whatever_they_ask(folder: Path):
                 SetPhase(P.MANUAL.value, "test", old_ms),
                 SetInsertionLock(False, "test", old_ms),
                 DeclarePosition(dict.fromkeys(AXES, 5), "test", old_ms),
+                CorrectPosition({"xt": 5}, {"xt": 5}, bench.bridge.last_motion, old_ms),
                 Move("late", dict.fromkeys(AXES, 5), None, bench.bridge.last_motion, old_ms),
                 Home("late home", "test", old_ms),
             ]
@@ -356,7 +368,7 @@ def test_requests_sent_too_long_ago_are_refused_whatever_they_ask(folder: Path):
 
 def test_there_is_no_other_request_than_those_tested_here():
     tested = {
-        Arm, Rearm, Disarm, SetPhase, SetInsertionLock, DeclarePosition, Move, Home
+        Arm, Rearm, Disarm, SetPhase, SetInsertionLock, DeclarePosition, CorrectPosition, Move, Home
     }  # fmt: skip
     from robot_bridge.daemon.rules import _RULES
 

@@ -214,23 +214,6 @@ def test_park_leaves_target_mode_so_that_unparking_moves_nothing():
         assert made.position_um(1) == pytest.approx(500, abs=1)
 
 
-def test_home_runs_to_the_hard_stop_and_declares_it():
-    with rig() as made, opened(made, declare=False, travel_min_um=0, home_um=0) as motors:
-        motors.home()
-        status = finish(motors)
-        assert status.certain
-        assert status.readback_um == {"xt": 0, "yt": 0}
-
-
-def test_home_needs_a_configured_place():
-    with (
-        rig() as made,
-        opened(made, home_um=None) as motors,
-        pytest.raises(MotorError, match="home_mm"),
-    ):
-        motors.home()
-
-
 def test_the_speed_is_capped_by_what_the_controller_measured():
     slow = Motor(capacitance_nf=2064)
     with rig(motor=slow) as made, opened(made) as motors:

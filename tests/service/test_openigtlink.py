@@ -21,6 +21,7 @@ from service.room.images import slice_pixels
 from service.room.state import (
     ArrivalState,
     FiducialState,
+    LostState,
     MeasurementState,
     ReconstructionState,
     RobotState,
@@ -146,7 +147,9 @@ CORONAL = {
 
 def state(**more) -> RoomState:
     given = {"robot": STANDING, **more}
-    return RoomState(revision=1, at_s=5.0, room="r", virtual=True, tolerance_mm=0.2, **given)
+    return RoomState(
+        revision=1, at_s=5.0, room="r", virtual=True, tolerance_mm=0.2, ready_valid_s=60.0, **given
+    )
 
 
 def seen_in(number: int, place: tuple[float, float, float]) -> MeasurementState:
@@ -210,13 +213,25 @@ def test_a_fiducial_is_a_sphere_of_its_size_in_the_patient():
     )
 
 
-@pytest.mark.parametrize(
-    "robot", [{"moving": True}, {"linked": False}, {"position_certain": False}]
-)
-def test_a_fiducial_is_not_shown_where_it_may_not_be_any_more(robot):
-    robot = STANDING.model_copy(update=robot)
-    scene = scene_of(state(robot=robot, measurement=seen_in(3, (1.0, 60.0, -2.0))))
-    assert scene["Fiducials"].withdraws
+LOST = LostState(code="moved", text="measured before the last move")
+
+
+def test_a_fiducial_is_not_shown_where_it_may_not_be_any_more():
+    seen = seen_in(3, (1.0, 60.0, -2.0))
+    for robot in (
+        STANDING.model_copy(update=change) for change in ({"moving": True}, {"linked": False})
+    ):
+        assert scene_of(state(robot=robot, measurement=seen))["Fiducials"].withdraws
+    lost = seen.model_copy(update={"lost": LOST})
+    assert scene_of(state(measurement=lost))["Fiducials"].withdraws
+
+
+def test_of_two_fiducials_only_the_one_that_was_seen_here_is_shown():
+    other = FiducialState(measurement_id=3, patient_mm=(1.0, 5.0, -2.0), radius_mm=4.5, lost=LOST)
+    scene = scene_of(state(measurement=seen_in(4, (1.0, 60.0, -2.0)), other_fiducial=other))
+    assert scene["Fiducials"] == points(
+        "Fiducials", 4.0, [Point("fiducial", (1.0, 60.0, -2.0), 9.0, (255, 200, 0))]
+    )
 
 
 GUIDE = GuideConfig(

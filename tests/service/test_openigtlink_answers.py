@@ -30,7 +30,14 @@ STATES = {
 
 def room(robot: RobotState = ROBOT, **more) -> RoomState:
     return RoomState(
-        revision=1, at_s=5.0, room="r", virtual=True, tolerance_mm=0.2, robot=robot, **more
+        revision=1,
+        at_s=5.0,
+        room="r",
+        virtual=True,
+        tolerance_mm=0.2,
+        ready_valid_s=60.0,
+        robot=robot,
+        **more,
     )
 
 

@@ -73,7 +73,7 @@ class ProcedureCommands:
         try:
             arguments = approach_of(
                 self._room.config,
-                self._room.link.travel_um,
+                self._room.link.travel_left_um,
                 start,
                 target,
                 self._newest_header(),

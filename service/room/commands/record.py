@@ -43,5 +43,5 @@ class RecordCommands:
         self._room.note("clock_sync", by, body)
 
     def forget_clock(self, why: str, by: str) -> None:
-        """The scanner's clock was set, or seemed to be: the next slices show it anew."""
+        """The scanner's clock was set, or seemed to be: slices wait for the next comparison."""
         reset_clock(self._room.record, by, why)

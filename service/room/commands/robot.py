@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from robot_bridge.client.client import BridgeError
+from robot_bridge.client.client import BridgeError, BridgeStatus
 from service.procedure.plan import PlanRefusedError, check_travel
 from service.procedure.registry import JOG
 from service.procedure.start_point import POSITION_DECLARED, positions_to_declare
@@ -23,11 +23,7 @@ class RobotCommands:
         pressed = self._room.stops.pressed
         try:
             if not status.position_certain:
-                positions_um = positions_to_declare(self._room.record, status.positions_um)
-                self._room.link.client.declare_position(positions_um, by)
-                counted_um = dict(status.positions_um)
-                body = {"positions_um": positions_um, "counted_um": counted_um}
-                self._room.note(POSITION_DECLARED, by, body)
+                self._declare_where_it_is_taken_to_stand(status, by)
             if status.stopped:
                 self._room.link.client.rearm(by)
             elif not status.armed:
@@ -36,6 +32,23 @@ class RobotCommands:
             raise ConflictError("robot_refused", str(error)) from error
         self._room.stops.release(pressed)
         self._room.note("armed", by, {})
+
+    def _declare_where_it_is_taken_to_stand(self, status: BridgeStatus, by: str) -> None:
+        """Each axis that is not certain: by the bridge's own memory, with its bound, if it has one.
+
+        Raises BridgeError.
+        """
+        counted_um = {
+            axis: at_um
+            for axis, at_um in status.positions_um.items()
+            if axis not in status.certain_axes
+        }
+        positions_um = positions_to_declare(self._room.record, counted_um)
+        positions_um |= status.remembered_um
+        within_um = {axis: status.bound_um[axis] for axis in status.remembered_um}
+        self._room.link.client.declare_position(positions_um, by, within_um)
+        body = {"positions_um": positions_um, "counted_um": counted_um, "within_um": within_um}
+        self._room.note(POSITION_DECLARED, by, body)
 
     def note_stop(self, by: str, emergency: bool) -> None:
         """STOP was sent already: record it and end the procedure."""
@@ -49,13 +62,14 @@ class RobotCommands:
         travel = self._room.travel()
         if axis not in travel or axis not in status.positions_um:
             raise ConflictError("unknown_axis", f"The robot has no axis {axis!r}.")
-        if not status.position_certain:
+        if axis not in status.certain_axes:
             raise ConflictError("position_uncertain", "Check the robot's position and re-arm.")
         setpoint_um = status.positions_um[axis] + distance_um
         try:
             check_travel({axis: setpoint_um}, travel)
         except PlanRefusedError as error:
-            raise ConflictError("out_of_travel", f"Not moved: {error}.") from error
+            known = f"; where it is is known to within {status.bound_um.get(axis, 0) / 1000:.3f} mm"
+            raise ConflictError("out_of_travel", f"Not moved: {error}{known}.") from error
         setpoints_um = {**status.positions_um, axis: setpoint_um}
         return self._room.begin(JOG, {"setpoints_um": setpoints_um}, by)
 

@@ -22,8 +22,8 @@ def clerk_router(orders: Orders) -> APIRouter:
     def clock_reset(body: ReasonBody, caller: Caller, key: Key = None) -> None:
         """Forget what was known of the scanner's clock, after it was set or an alarm said so.
 
-        The next slice shows the clock anew, so it must come promptly: first let the scanner send
-        what it still holds back. A comparison (PUT /api/v1/clock) is better where it can be made.
+        Slices wait until the clocks are compared (PUT /api/v1/clock), and what comes soon after may
+        have been acquired before: let the scanner send first what it still holds back.
         """
         orders.carry_out(caller, key, "forget_clock", body)
 

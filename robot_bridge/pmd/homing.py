@@ -1,0 +1,204 @@
+"""Finding the reference of one axis, and believing it only on evidence.
+
+A limit switch counts if it was off before the run, is the one at that end, is on after it and
+goes off again when the axis leaves it. A mechanical end counts if the encoder followed the motor,
+stopped following it there, and follows it away. An axis with neither cannot be homed, only
+declared. What does not add up is a fault `cannot_home` that says why; the position is uncertain
+then.
+"""
+
+from robot_bridge.daemon.config import HOMING_OVERTRAVEL
+from robot_bridge.pmd import protocol as pmd_protocol
+from robot_bridge.pmd import units as pmd_units
+from robot_bridge.pmd.axis import FOLLOWS, PmdAxis, agrees, disagreement
+from robot_bridge.pmd.controller import AxisFaultError, Steps
+from robot_bridge.pmd.line import Procedure
+from robot_bridge.pmd.protocol import Command
+from robot_bridge.pmd.status import Inputs
+
+CHUNK_UM = 2000.0  # of a run towards a mechanical end, between two looks at the encoder
+BACK_OFF_UM = 1000.0
+STANDS = 0.2  # of the way that the motor's steps should make
+INDEX_LATCHED, INDEX_SEARCH = 1, 4
+
+
+def home(axis: PmdAxis, home_um: int) -> Procedure:
+    """Find the place that is called `home_um`, and declare it."""
+    axis.fault = None
+    yield from axis.unpark()
+    axis.certain = False
+    axis.proven = False
+    if axis.config.home_to == "index":
+        yield from _home_to_index(axis, home_um)
+        return
+    axis.limit_wiring = (yield from axis.ask("Y2")).integer()
+    if axis.limit_wiring:
+        yield from _home_to_switch(axis, home_um)
+    elif axis.closed_loop:
+        yield from _home_to_end(axis, home_um)
+    else:
+        raise _cannot(
+            axis,
+            "it has neither an encoder nor a limit switch to tell that it is there; declare it",
+        )
+
+
+def _cannot(axis: PmdAxis, why: str) -> AxisFaultError:
+    return axis.error("cannot_home", f"cannot home: {why}")
+
+
+def _outwards(axis: PmdAxis, home_um: int) -> int:
+    """+1 or -1 in the axis's own direction, towards the end that is nearest to `home_um`."""
+    config = axis.config
+    low = home_um - config.travel_min_um <= config.travel_max_um - home_um
+    return -1 if low else 1
+
+
+def _search_um(axis: PmdAxis) -> float:
+    return HOMING_OVERTRAVEL * (axis.config.travel_max_um - axis.config.travel_min_um)
+
+
+def _run(axis: PmdAxis, distance_um: float) -> Steps[None]:
+    yield from axis.run_open_loop(pmd_units.microsteps_from_um(axis.config, distance_um))
+
+
+# --- limit switches ---------------------------------------------------------------------------
+
+
+def _home_to_switch(axis: PmdAxis, home_um: int) -> Steps[None]:
+    outwards = _outwards(axis, home_um)
+    forward = outwards * axis.config.sign > 0
+    name, other = ("forward", "reverse") if forward else ("reverse", "forward")
+    before = yield from axis.read_inputs()
+    if _is_on(before, name) or _is_on(before, other):
+        on = name if _is_on(before, name) else other
+        raise _cannot(
+            axis,
+            f"the {on} limit switch is on before the run: stuck, wired the other way round, or the "
+            "axis stands on it (jog off it first)",
+        )
+    if not (yield from _run_to_switch(axis, outwards * _search_um(axis))):
+        raise _cannot(axis, f"no limit switch after {_search_um(axis) / 1000:.1f} mm")
+    there = yield from axis.read_inputs()
+    if not _is_on(there, name) or _is_on(there, other):
+        wrong = other if _is_on(there, other) else "no"
+        raise _cannot(axis, f"the run {name} was stopped, and {wrong} limit switch is on now")
+    yield from axis.read_position()
+    at_um = axis.position_um
+    yield from _leave(axis, -outwards * min(BACK_OFF_UM, _search_um(axis) / 4), name)
+    yield from _expect_encoder(axis, at_um, -outwards * min(BACK_OFF_UM, _search_um(axis) / 4))
+    if not (yield from _run_to_switch(axis, outwards * 2 * BACK_OFF_UM)):
+        raise _cannot(axis, f"the {name} limit switch did not come back")
+    yield pmd_protocol.stop(axis.address)
+    yield from axis.declare(home_um)
+
+
+def _is_on(inputs: Inputs, name: str) -> bool:
+    return inputs.forward if name == "forward" else inputs.reverse
+
+
+def _run_to_switch(axis: PmdAxis, distance_um: float) -> Steps[bool]:
+    """Whether a limit switch ended the run."""
+    try:
+        yield from _run(axis, distance_um)
+    except AxisFaultError as error:
+        if error.code != "external_limit":
+            raise
+        yield pmd_protocol.stop(axis.address)  # needed before it goes the other way
+        return True
+    return False
+
+
+def _leave(axis: PmdAxis, distance_um: float, name: str) -> Steps[None]:
+    if (yield from _run_to_switch(axis, distance_um)) or _is_on(
+        (yield from axis.read_inputs()), name
+    ):
+        raise _cannot(axis, f"the {name} limit switch does not go off when the axis leaves it")
+
+
+def _expect_encoder(axis: PmdAxis, from_um: float, distance_um: float) -> Steps[None]:
+    if not axis.closed_loop:
+        return
+    yield from axis.read_position()
+    moved_um = axis.position_um - from_um
+    if not agrees(moved_um, distance_um):
+        raise _cannot(axis, disagreement(moved_um, distance_um))
+    axis.proven = True
+
+
+# --- mechanical ends, told by the encoder -----------------------------------------------------
+
+
+def _home_to_end(axis: PmdAxis, home_um: int) -> Steps[None]:
+    outwards = _outwards(axis, home_um)
+    yield from _run_to_end(axis, outwards, _search_um(axis))
+    yield from axis.read_position_surely()
+    at_um = axis.position_um
+    back_um = min(BACK_OFF_UM, _search_um(axis) / 4)
+    yield from _run(axis, -outwards * back_um)
+    yield from _expect_encoder(axis, at_um, -outwards * back_um)
+    yield from _run_to_end(axis, outwards, 3 * back_um)
+    yield from axis.read_position_surely()
+    if abs(axis.position_um - at_um) > max(axis.config.tolerance_um, axis.jitter_um):
+        raise _cannot(
+            axis,
+            f"the end was {axis.position_um - at_um:+.0f} um elsewhere the second time",
+        )
+    yield pmd_protocol.stop(axis.address)
+    yield from axis.declare(home_um)
+
+
+def _run_to_end(axis: PmdAxis, outwards: int, search_um: float) -> Steps[None]:
+    """In short runs, until the encoder does not follow any more."""
+    gone_um = 0.0
+    while gone_um < search_um:
+        yield from axis.read_position()
+        from_um = axis.position_um
+        yield from _run(axis, outwards * CHUNK_UM)
+        yield from axis.read_position()
+        moved_um = axis.position_um - from_um
+        if abs(moved_um) < STANDS * CHUNK_UM:
+            return
+        if outwards * moved_um < 0 or abs(moved_um) > CHUNK_UM / FOLLOWS:
+            raise _cannot(axis, disagreement(moved_um, outwards * CHUNK_UM))
+        gone_um += CHUNK_UM
+    raise _cannot(axis, f"no end after {search_um / 1000:.1f} mm")
+
+
+# --- the encoder's index ----------------------------------------------------------------------
+
+
+def _home_to_index(axis: PmdAxis, home_um: int) -> Steps[None]:
+    """The count is reset as the index passes; what was travelled since then is in it."""
+    outwards = _outwards(axis, home_um)
+    for direction in (outwards, -outwards):
+        yield from axis.read_position()
+        from_um = axis.position_um
+        yield Command(axis.address, f"N{INDEX_SEARCH}", reads=False)
+        found = yield from _search_index(axis, direction * _search_um(axis))
+        if found:
+            yield pmd_protocol.stop(axis.address)
+            count = (yield from axis.ask("E")).integer()
+            offset = pmd_units.count_from_um(axis.config, home_um)
+            yield from axis.declare_count(count + offset)
+            return
+        yield from _expect_any_motion(axis, from_um)
+    raise _cannot(axis, "the encoder's index was not found in either direction")
+
+
+def _expect_any_motion(axis: PmdAxis, from_um: float) -> Steps[None]:
+    yield from axis.read_position()
+    if abs(axis.position_um - from_um) <= axis.jitter_um:
+        raise _cannot(axis, "the encoder did not move")
+
+
+def _search_index(axis: PmdAxis, distance_um: float) -> Steps[bool]:
+    microsteps = pmd_units.microsteps_from_um(axis.config, distance_um)
+    try:
+        yield from axis.run_to_index(microsteps)
+    except AxisFaultError as error:
+        if error.code != "external_limit":
+            raise
+        yield pmd_protocol.stop(axis.address)
+    mode = (yield from axis.ask("N")).integer()
+    return mode == INDEX_LATCHED

@@ -1,0 +1,137 @@
+"""A reference is believed on evidence alone: the truth is the stage's own position."""
+
+import pytest
+from pmd_rig import StageWithEnds, finish, opened, rig, wait_until
+
+from robot_bridge.daemon.motors import MotorError
+from robot_bridge.emulator.axis import Motor
+
+SWITCHED = Motor(switches_um=(-20_000.0, 20_000.0))
+WIRED = {"limit_switches": 1}
+
+
+def test_a_mechanical_end_is_found_by_the_encoder_that_stops_following():
+    with rig(stage=StageWithEnds) as made, opened(made, "closed_loop", declare=False) as motors:
+        motors.home()
+        status = finish(motors)
+        assert status.fault is None, status
+        assert status.certain
+        assert status.readback_um == {"xt": -20_000, "yt": -20_000}
+        assert made.position_um(1) == pytest.approx(-21_000, abs=1)
+        motors.move_to({"xt": 0, "yt": -20_000})
+        assert finish(motors).reached
+        assert made.position_um(1) == pytest.approx(-1000, abs=1)
+        assert made.position_um(2) == pytest.approx(-21_000, abs=1)
+
+
+@pytest.mark.parametrize("drive", ["open_loop", "closed_loop"])
+def test_a_limit_switch_is_left_again_before_it_is_believed(drive: str):
+    with rig(motor=SWITCHED) as made, opened(made, drive, declare=False, **WIRED) as motors:
+        motors.home()
+        status = finish(motors)
+        assert status.fault is None, status
+        assert status.certain
+        assert status.readback_um == {"xt": -20_000, "yt": -20_000}
+        assert made.position_um(1) == pytest.approx(-20_000, abs=30)
+
+
+def test_one_axis_is_homed_and_the_others_neither_move_nor_become_certain():
+    with rig(motor=SWITCHED) as made, opened(made, declare=False, **WIRED) as motors:
+        motors.home(["yt"])
+        status = finish(motors)
+        assert status.certain_axes == {"yt"}
+        assert made.position_um(1) == 0
+
+
+def test_the_index_of_an_encoder_is_found_and_left_behind_in_the_count():
+    motor = Motor(index_um=3000.0)
+    changes = {"home_um": 500, "home_to": "index"}
+    with (
+        rig(stage=StageWithEnds, motor=motor) as made,
+        opened(made, "closed_loop", declare=False, **changes) as motors,
+    ):
+        motors.home(["xt"])
+        status = finish(motors)
+        assert status.fault is None, status
+        motors.move_to({"xt": 500})
+        assert finish(motors).reached
+        assert made.position_um(1) == pytest.approx(3000, abs=2)
+
+
+def refused(motors, why: str) -> None:
+    status = finish(motors)
+    assert status.fault == "cannot_home"
+    assert why in status.fault_text
+    assert "xt" not in status.certain_axes
+    for _ in range(5):
+        motors.poll()
+    with pytest.raises(MotorError):
+        motors.move_to({"xt": 10_000, "yt": 0})
+
+
+def test_an_axis_with_neither_encoder_nor_switch_is_declared_and_not_homed():
+    with rig(stage=StageWithEnds) as made, opened(made, declare=False) as motors:
+        motors.home(["xt"])
+        refused(motors, "neither an encoder nor a limit switch")
+        assert made.position_um(1) == 0
+
+
+@pytest.mark.parametrize("drive", ["open_loop", "closed_loop"])
+@pytest.mark.parametrize("stuck", ["limit_switch", "limit_reverse", "limit_forward"])
+def test_a_switch_that_is_on_before_the_run_is_no_reference(drive: str, stuck: str):
+    with rig(motor=SWITCHED) as made, opened(made, drive, declare=False, **WIRED) as motors:
+        with made.lock:
+            setattr(made.controller(1).faults, stuck, True)
+        motors.home(["xt"])
+        refused(motors, "limit switch is on before the run")
+        assert made.position_um(1) == 0
+
+
+def test_a_switch_that_sticks_on_the_way_is_no_reference():
+    with (
+        rig(motor=SWITCHED, speed_factor=2.0) as made,
+        opened(made, declare=False, **WIRED) as motors,
+    ):
+        motors.home(["xt"])
+        wait_until(motors, lambda s: made.position_um(1) < -500)
+        with made.lock:
+            made.controller(1).faults.limit_reverse = True
+        refused(motors, "does not go off when the axis leaves it")
+
+
+def test_switches_that_are_wired_the_wrong_way_round_are_no_reference():
+    wrong = Motor(switches_um=(-20_000.0, 20_000.0), mounting=-1)
+    with (
+        rig(motor=wrong, stage=StageWithEnds) as made,
+        opened(made, declare=False, **WIRED) as motors,
+    ):
+        motors.home(["xt"])
+        refused(motors, "limit switch")
+
+
+@pytest.mark.parametrize("fault", ["stalled", "encoder_frozen"])
+def test_an_encoder_that_does_not_move_is_no_reference(fault: str):
+    with rig(stage=StageWithEnds) as made, opened(made, "closed_loop", declare=False) as motors:
+        with made.lock:
+            setattr(made.controller(1).faults, fault, True)
+        motors.home(["xt"])
+        refused(motors, "the encoder")
+
+
+@pytest.mark.parametrize("wrong", [{"um_per_count": 0.05}, {"encoder_reversed": True}])
+def test_an_encoder_that_counts_wrongly_is_no_reference(wrong: dict):
+    with (
+        rig(stage=StageWithEnds, motor=Motor(**wrong)) as made,
+        opened(made, "closed_loop", declare=False) as motors,
+    ):
+        motors.home(["xt"])
+        refused(motors, "counts_per_mm")
+
+
+def test_home_needs_a_configured_place():
+    with (
+        rig() as made,
+        opened(made, home_um=None) as motors,
+        pytest.raises(MotorError, match="home_mm"),
+    ):
+        motors.home()
