@@ -82,6 +82,13 @@ class Slices(Connection):
             raise CaseRecordError(f"{self.case_dir}: there is no slice {slice_id}")
         return _slice(row)
 
+    def slices_by_hand(self) -> frozenset[int]:
+        """Ids of the used slices that a person assigned."""
+        rows = self._db.execute(
+            "SELECT slice_id FROM slice WHERE state = 'assigned' AND decided_by != 'listener'"
+        )
+        return frozenset(int(row["slice_id"]) for row in rows)
+
     def last_slice(self, state: str | None = None) -> SliceRow | None:
         where = "state = ?" if state else "1"
         row = self._db.execute(

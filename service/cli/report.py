@@ -22,7 +22,7 @@ from case_record.rows import Measurement
 from room_config.exit_codes import BAD_INPUT
 from service.procedure.estimate import axis_sigma
 from service.procedure.registry import APPROACHES, CALIBRATIONS
-from service.room.history import known_targets, targets_over_time
+from service.room.history import arrival_by_hand, known_targets, targets_over_time
 from service.room.images import ImageMissingError, slice_pixels
 
 app = typer.Typer(add_completion=False)
@@ -155,6 +155,7 @@ def _approaches(record: CaseRecord) -> Iterable[str]:
                 result.get("iterations", ""),
                 result.get("frames", ""),
                 f"{minutes:.1f}",
+                "by hand" if arrival_by_hand(record, row.procedure_id) else "",
                 result.get("reason", ""),
             )
         )
@@ -170,6 +171,7 @@ def _approaches(record: CaseRecord) -> Iterable[str]:
         "moves",
         "slices",
         "min",
+        "slices used",
         "reason",
     )
     yield _table(heads, rows)

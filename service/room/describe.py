@@ -28,6 +28,7 @@ from service.room.describe_measurement import (
     describe_reconstruction,
 )
 from service.room.execution import Execution
+from service.room.history import arrival_by_hand, rests_on_slices
 from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
 from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
@@ -93,7 +94,7 @@ class Describer:
                 "case_uid": case.case_uid if case else "",
                 "case": _case(record),
                 **_procedures(record, execution),
-                "prompt": prompt(config, record, link, execution, found),
+                "prompt": prompt(config, record, link, execution, found) + _marked(arrival),
                 "ready": arrival is not None,
                 "ready_lost": _lost_ready(found),
                 "arrival": arrival,
@@ -237,7 +238,14 @@ def _arrival(record: CaseRecord, found: Readiness | None, now: Now) -> ArrivalSt
     known = {name: result[name] for name in ArrivalState.model_fields if name in result}
     measurement = record.measurement(int(result["measurement_id"]))
     age = age_s(measurement.request[RESTS_ON], now)
-    return ArrivalState(procedure_id=found.procedure_id, **{**known, "age_s": age})
+    by_hand = arrival_by_hand(record, found.procedure_id)
+    more = {"age_s": age, "by_hand": by_hand}
+    return ArrivalState(procedure_id=found.procedure_id, **{**known, **more})
+
+
+def _marked(arrival: ArrivalState | None) -> str:
+    """An overrule is never out of sight where READY rests on it."""
+    return "" if arrival is None or not arrival.by_hand else " (rests on slices used by hand)"
 
 
 def _lost_ready(found: Readiness | None) -> LostState | None:
@@ -254,6 +262,7 @@ def _measurement(record: CaseRecord, last: Measurement | None, now: Now) -> Meas
     update = {
         "lost": None if lost is None else LostState(code=lost.code, text=lost.text),
         "age_s": None if facts is None else age_s(facts, now),
+        "by_hand": rests_on_slices(last, record.slices_by_hand()),
     }
     return describe_measurement(last).model_copy(update=update)
 

@@ -60,7 +60,8 @@ class LostState(_Frozen):
 class MeasurementState(_Frozen):
     """The newest finished measurement: positions in the slice and in the patient.
 
-    lost: why it does not say any more where the fiducial is; age_s: since it was asked for.
+    lost: why it does not say any more where the fiducial is; age_s: since it was asked for;
+    by_hand: it rests on a slice that a person assigned against the listener.
     """
 
     measurement_id: int
@@ -80,6 +81,7 @@ class MeasurementState(_Frozen):
     has_reconstruction: bool = False
     age_s: float | None = None
     lost: LostState | None = None
+    by_hand: bool = False
 
 
 class FiducialState(_Frozen):
@@ -132,6 +134,7 @@ class ArrivalState(_Frozen):
     tip_mm: tuple[float, float, float] | None = None
     joint_mm: tuple[float, float, float] | None = None
     age_s: float | None = None
+    by_hand: bool = False
 
 
 class SliceState(_Frozen):

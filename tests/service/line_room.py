@@ -228,7 +228,7 @@ class LineRoom:
             "row_direction": [0.0, 0.0, -1.0],
             "col_direction": [1.0, 0.0, 0.0],
             "spacing_mm": [1.0, 1.0],
-        }
+        } | header.get("geometry", {})
         row = self.loop._record.add_slice(
             NewSlice(
                 sop_instance_uid=f"1.2.3.{self._slices}",

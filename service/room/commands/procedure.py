@@ -30,6 +30,7 @@ from service.procedure.targets import (
     why_void_target,
 )
 from service.room.context import Room
+from service.room.history import arrival_by_hand
 from service.room.present import PUNCTURE, readiness
 from service.room.readiness import ConflictError
 
@@ -197,6 +198,7 @@ class ProcedureCommands:
             "insertion_depth_mm": insertion_depth_mm,
             "error_mm": found.arrival["error_mm"],
             "sigma_mm": found.arrival["sigma_mm"],
+            "by_hand": arrival_by_hand(self._room.record, found.procedure_id),
         }
         self._room.note(PUNCTURE, by, body)
 
