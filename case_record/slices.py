@@ -97,6 +97,15 @@ class Slices(Connection):
         ).fetchone()
         return _slice(row) if row else None
 
+    def last_slice_with_reason(self, reason_code: str) -> SliceRow | None:
+        """The newest slice that lies aside for this reason."""
+        row = self._db.execute(
+            "SELECT * FROM slice WHERE state = 'quarantined' AND reason_code = ?"
+            " ORDER BY slice_id DESC LIMIT 1",
+            (reason_code,),
+        ).fetchone()
+        return _slice(row) if row else None
+
     def scans_since(self, seq: int) -> list[dict[str, Any]]:
         """The kinds of slices that came later: state, reason_code, and of the header study, frame
         of reference and what shifts oil against water.

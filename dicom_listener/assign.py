@@ -115,7 +115,7 @@ def assign(
     holds: all of the case, in their order; known: usable slices received before, oldest first.
     binding: of the case; None: as the first used one of the known slices binds it.
     """
-    other = why_not_of(binding or _bound_by(known), slice_)
+    other = why_not_of(binding or _bound_by(known), slice_.identity)
     if other is not None:
         return Quarantined(other.code, other.text)
     if not any(hold.was_open_at(received_s) for hold in holds) and not holds:
@@ -139,7 +139,7 @@ def assign(
 
 def _bound_by(known: Sequence[Known]) -> Binding | None:
     first = next((one for one in known if one.hold_id is not None), None)
-    return None if first is None else Binding.of_slice(first.slice)
+    return None if first is None else Binding.to(first.slice.identity)
 
 
 # 1 and 2: time and receipt

@@ -8,11 +8,11 @@ former one is void then. Pure: no file, no record.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from dicom_slice.header import Slice
+from dicom_slice.patient import Identity
 from dicom_slice.reasons import Reason, SetAside
 
 BOUND, ACCEPTED = "case_bound", "study_accepted"
@@ -27,27 +27,49 @@ class Binding:
     frame_of_reference: str
 
     @classmethod
-    def of_slice(cls, slice_: Slice) -> Binding:
-        return cls(
-            slice_.patient_digest,
-            frozenset({slice_.study_instance_uid}),
-            slice_.frame_of_reference_uid,
+    def to(cls, whose: Identity) -> Binding:
+        return cls(whose.patient, frozenset({whose.study}), whose.frame_of_reference)
+
+    def with_study(self, whose: Identity) -> Binding:
+        """A person says that this study belongs to the case, too; its frame of reference holds."""
+        return replace(
+            self,
+            studies=self.studies | {whose.study},
+            frame_of_reference=whose.frame_of_reference,
         )
 
-    def with_study(self, study: str, frame_of_reference: str) -> Binding:
-        """A person says that this study belongs to the case, too; its frame of reference holds."""
-        return replace(self, studies=self.studies | {study}, frame_of_reference=frame_of_reference)
+
+def after_event(binding: Binding | None, kind: str, body: Mapping[str, Any]) -> Binding | None:
+    """The binding after an event of the case, which may be of any kind."""
+    if kind == BOUND:
+        return Binding.to(_identity(body))
+    if kind == ACCEPTED and binding is not None:
+        return binding.with_study(_identity(body))
+    return binding
 
 
-def why_not_of(binding: Binding | None, slice_: Slice) -> SetAside | None:
-    """Why the slice does not belong to what is bound, or None. An unbound case takes any."""
+def event_body(whose: Identity) -> dict[str, Any]:
+    """What an event that binds, or accepts a study, says."""
+    return {
+        "patient": whose.patient,
+        "study": whose.study,
+        "frame_of_reference": whose.frame_of_reference,
+    }
+
+
+def _identity(body: Mapping[str, Any]) -> Identity:
+    return Identity(body["patient"], body["study"], body["frame_of_reference"])
+
+
+def why_not_of(binding: Binding | None, whose: Identity) -> SetAside | None:
+    """Why a slice does not belong to what is bound, or None. An unbound case takes any."""
     if binding is None:
         return None
-    if _differ(binding.patient, slice_.patient_digest):
+    if _differ(binding.patient, whose.patient):
         return SetAside(Reason.OTHER_PATIENT, "it is of another patient than this case")
-    if slice_.study_instance_uid not in binding.studies:
+    if whose.study not in binding.studies:
         return SetAside(Reason.OTHER_STUDY, "it is of another study than this case")
-    if _differ(binding.frame_of_reference, slice_.frame_of_reference_uid):
+    if _differ(binding.frame_of_reference, whose.frame_of_reference):
         return SetAside(
             Reason.OTHER_FRAME,
             "its frame of reference is another one: the table or the patient was moved",
@@ -58,25 +80,3 @@ def why_not_of(binding: Binding | None, slice_: Slice) -> SetAside | None:
 def _differ(bound: str, found: str) -> bool:
     """A slice that does not say is no other one; the study still has to agree."""
     return bool(bound) and bool(found) and bound != found
-
-
-def binding_of(bodies: Iterable[tuple[str, Mapping[str, Any]]]) -> Binding | None:
-    """The binding as the events of a case tell it: (kind, body), oldest first."""
-    binding = None
-    for kind, body in bodies:
-        if kind == BOUND:
-            binding = Binding(
-                body["patient"], frozenset({body["study"]}), body["frame_of_reference"]
-            )
-        elif kind == ACCEPTED and binding is not None:
-            binding = binding.with_study(body["study"], body["frame_of_reference"])
-    return binding
-
-
-def bound_body(slice_: Slice) -> dict[str, Any]:
-    """What the event of the first used slice says."""
-    return {
-        "patient": slice_.patient_digest,
-        "study": slice_.study_instance_uid,
-        "frame_of_reference": slice_.frame_of_reference_uid,
-    }

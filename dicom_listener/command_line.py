@@ -4,6 +4,7 @@ import logging
 import signal
 import sys
 import threading
+import warnings
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -37,6 +38,8 @@ def listener(
 ) -> None:
     """Receive slices (C-STORE), keep them durably, and assign them to holds."""
     configure_logs(logging.INFO)
+    # odd values stand with their slice in the record; a line of the log is for people
+    warnings.filterwarnings("ignore", module="pydicom")
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     try:
         room = load_config(config)

@@ -26,7 +26,9 @@ from dicom_listener.assign import (
     Pending,
     assign,
 )
+from dicom_listener.case_gate import CaseGate
 from dicom_listener.clock import ClockRules, Comparison
+from dicom_listener.holding_area import INBOX, Arrival
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.scanner_clocks import ScannerClocks
@@ -66,9 +68,16 @@ class Intake:
     """Owns this process's connection to the record; use it in the thread that made it."""
 
     def __init__(
-        self, record: CaseRecord, inbox: Inbox, rules: IntakeRules, metrics: ListenerMetrics
+        self,
+        record: CaseRecord,
+        inbox: Inbox,
+        rules: IntakeRules,
+        metrics: ListenerMetrics,
+        gate: CaseGate | None = None,
     ) -> None:
+        """gate: what of all that arrives goes into this case; None: everything."""
         self._record = record
+        self._gate = gate or CaseGate(record)
         self._inbox = inbox
         self._rules = rules
         self._metrics = metrics
@@ -125,7 +134,13 @@ class Intake:
 
     def left_over(self) -> list[Path]:
         """Inbox files that the record does not have yet, oldest first."""
-        return [path for path in self._inbox.files() if self._named(path) not in self._done]
+        for path in self._inbox.files():
+            if self._named(path) in self._done:  # a power cut took the last move back
+                self._gate.bring_in(path)
+        folders = {self._inbox.folder, self._record.case_dir / INBOX}
+        found = [path for folder in folders for path in folder.glob("*.dcm")]
+        new = [path for path in found if self._named(path) not in self._done]
+        return sorted(new, key=lambda path: path.name)
 
     def look_at_record(self) -> None:
         """Follow what the other processes wrote: holds, confirmations, syncs, re-assignments."""
@@ -162,6 +177,12 @@ class Intake:
             reason = SetAside(Reason.UNREADABLE, f"internal error: {type(error).__name__}")
             rows, slices = [row_without_header(envelope, name, reason)], [None]
             self.alarm("intake_failed", f"{name}: {type(error).__name__}")
+        arrival = Arrival.of_file(path, envelope, slices)
+        elsewhere = self._gate.why_elsewhere(arrival, rows)
+        if elsewhere is not None:
+            self._gate.hold(arrival, elsewhere)
+            return
+        self._gate.bring_in(path)
         self._write(rows, slices, envelope)
         self._done.add(name)
         self._decide_pending()
@@ -190,8 +211,10 @@ class Intake:
 
     # One file
 
-    def _named(self, path: Path) -> str:
-        return path.relative_to(self._record.case_dir).as_posix()
+    @staticmethod
+    def _named(path: Path) -> str:
+        """Under what name the record has a file, wherever it lies yet."""
+        return f"{INBOX}/{path.name}"
 
     def _envelope(self, path: Path) -> Envelope:
         envelope, _ = read_envelope(path)
@@ -273,6 +296,7 @@ class Intake:
             known,
             self._clocks.offset(slice_, received_s),
             self._rules.assign,
+            self._gate.binding,
         )
 
     def _holds(self) -> list[HoldWindow]:
@@ -291,8 +315,13 @@ class Intake:
                 self._pending[row.slice_id] = slice_
                 self._note_clockless(row.slice_id, row.reason_code)
             self._know(row.slice_id, slice_, row)
+            self._note_use(slice_, row.hold_id)
         if any(row.reason_code == Reason.UID_CONFLICT for row in rows):
             self.alarm("same_uid_other_bytes", f"{envelope.sop_instance_uid}: both are kept")
+
+    def _note_use(self, slice_: Slice, hold_id: int | None) -> None:
+        if hold_id is not None:
+            self._gate.used(slice_.identity)
 
     # What the other processes say
 
@@ -313,6 +342,7 @@ class Intake:
 
     def _heed(self, event: Event, replaying: bool) -> None:
         kind, body = event.kind, event.body
+        self._gate.heed(event, replaying=replaying)
         self._clocks.heed(kind, body, event.wall_s)
         if kind == "acquisition_confirmed":
             self._confirmed.add(int(body["hold_id"]))
@@ -325,6 +355,7 @@ class Intake:
         slice_ = self._slice_of(row)
         if slice_ is not None:
             self._known[row.slice_id] = Known(slice_, row.received_s, row.hold_id, row.reason_code)
+            self._note_use(slice_, row.hold_id)
 
     def _decide_pending(self) -> None:
         """Ask again for those that wait; for the clock's sake only when more is known of it."""
@@ -372,6 +403,7 @@ class Intake:
         if not isinstance(decision, Pending):
             slice_ = self._pending.pop(row.slice_id)
             self._known[row.slice_id] = Known(slice_, row.received_s, hold_id, code)
+            self._note_use(slice_, hold_id)
 
     def _event(self, kind: str, body: dict[str, Any]) -> None:
         self._record.append_event(kind, body, source=SOURCE)

@@ -17,6 +17,7 @@ class ListenerMetrics:
         self.refused = self._counter("slices_refused", "C-STORE requests refused", "status")
         self.echoes = self._counter("echoes", "C-ECHO requests answered")
         self.associations = self._counter("associations", "Associations by outcome", "outcome")
+        self.endings = self._counter("association_endings", "Associations by ending", "ending")
         self.dropped = self._counter("connections_dropped", "Connections without an association")
         self.decided = self._counter("slices_decided", "Frames by decision", "state", "reason")
         self.duplicates = self._counter("duplicates", "Instances received again, same bytes")

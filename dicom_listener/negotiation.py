@@ -13,7 +13,10 @@ from pydicom.uid import (
 )
 from pynetdicom import AE, AllStoragePresentationContexts
 from pynetdicom.association import Association
-from pynetdicom.presentation import PresentationContext
+from pynetdicom.pdu_primitives import SOPClassCommonExtendedNegotiation
+from pynetdicom.presentation import PresentationContext, build_context
+from pynetdicom.service_class import ServiceClass, StorageServiceClass
+from pynetdicom.sop_class import uid_to_service_class
 
 from dicom_slice.quirks import MR_CLASSES
 
@@ -69,6 +72,41 @@ def add_contexts(ae: AE, *, any_storage_class: bool) -> None:
         ae.add_supported_context(uid, syntaxes)
 
 
+def is_storage(abstract_syntax: str) -> bool:
+    """Whether it is a kind of object, for all that anybody knows: private ones, retired ones."""
+    uid = UID(abstract_syntax)
+    known = uid_to_service_class(uid)
+    if known is not ServiceClass:
+        return issubclass(known, StorageServiceClass)
+    is_in_dictionary = uid.name != uid
+    return not is_in_dictionary or "Storage" in uid.name
+
+
+def contexts_for(
+    proposed: Sequence[PresentationContext], supported: Sequence[PresentationContext]
+) -> list[PresentationContext]:
+    """Contexts beside the supported ones for the kinds of objects that nobody has listed."""
+    listed = {str(context.abstract_syntax) for context in supported}
+    unlisted = {str(context.abstract_syntax) for context in proposed} - listed
+    return [
+        build_context(uid, decodable_syntaxes()) for uid in sorted(filter(is_storage, unlisted))
+    ]
+
+
+def as_storage(
+    proposed: Sequence[PresentationContext],
+) -> dict[UID, SOPClassCommonExtendedNegotiation]:
+    """What tells pynetdicom that messages of a class that it does not know are to be stored."""
+    items = {}
+    for context in proposed:
+        uid = UID(str(context.abstract_syntax))
+        if is_storage(uid) and uid_to_service_class(uid) is ServiceClass:
+            item = items[uid] = SOPClassCommonExtendedNegotiation()
+            item.sop_class_uid = uid
+            item.service_class_uid = UID(StorageServiceClass.uid)
+    return items
+
+
 @dataclass(frozen=True)
 class NegotiationReport:
     """Who asked for what, and what we said."""
@@ -102,6 +140,7 @@ def report_of(association: Association, why_rejected: str = "") -> NegotiationRe
             _line(context, accepted.get(context.context_id), refused.get(context.context_id))
             for context in request.presentation_context_definition_list
         ]
+        lines += [f"  {remark}" for remark in getattr(association.dul.socket, "remarks", ())]
     return NegotiationReport(
         calling_ae_title=str(request.calling_ae_title).strip(),
         called_ae_title=str(request.called_ae_title).strip(),

@@ -15,12 +15,14 @@ import structlog
 from case_record.attempts import MOST_DEATHS, Attempts
 from case_record.cases import Cases
 from case_record.presence import Presence, Sole
-from case_record.record import CaseRecord
+from case_record.record import CaseRecord, CaseRecordError
 from dicom_listener.assign import AssignRules
 from dicom_listener.clock import ClockRules, Comparison, Promptness
+from dicom_listener.holding_area import INBOX
 from dicom_listener.inbox import Inbox
-from dicom_listener.intake import Intake, IntakeRules
+from dicom_listener.intake import IntakeRules
 from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.reception import Reception
 from dicom_listener.retention import remove_old
 from dicom_listener.scp import Scp, ScpRules, tls_context
 from dicom_slice.usable import SliceRules
@@ -53,8 +55,8 @@ class PortError(ConfigError):
     """The port cannot be bound: most often another process has it."""
 
 
-def inbox_folder(case_dir: Path) -> Path:
-    return case_dir / "inbox"
+def inbox_folder(home: Path) -> Path:
+    return home / INBOX
 
 
 def scp_rules(config: ListenerConfig) -> ScpRules:
@@ -151,11 +153,12 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
     received: SimpleQueue[Path] = SimpleQueue()
     metrics = ListenerMetrics()
     with ExitStack() as stack:
-        case_dir = Cases(*config.room.folders).required()
-        stack.enter_context(Sole(case_dir, "listener"))
-        record = stack.enter_context(CaseRecord(case_dir, create=True))
+        cases = Cases(*config.room.folders)
+        stack.enter_context(Sole(cases.home, "listener"))
+        if cases.only is not None:
+            CaseRecord(cases.only, create=True).close()
         inbox = Inbox(
-            inbox_folder(case_dir),
+            inbox_folder(cases.home),
             min_free_bytes=config.listener.min_free_mib * _MIB,
         )
         rules = intake_rules(config)
@@ -172,23 +175,22 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         scp.start()
         on_ready(Ready(scp.port, metrics_port, config.listener.ae_title))
         # Receiving needs no memory of the case: a long record must not keep a scanner waiting.
-        intake = Intake(record, inbox, rules, metrics)
-        stack.callback(intake.close)
+        reception = Reception(cases, inbox, rules, metrics)
+        stack.callback(reception.close)
+        reception.follow()
         if discarded:
-            intake.alarm("unfinished_files", f"{discarded} unanswered files of an earlier run")
-        left_over = intake.left_over()
-        for path in left_over:
-            received.put(path)
-        log.info("serving", port=scp.port, left_over=len(left_over))
-        presence = stack.enter_context(Presence(case_dir, "listener"))
+            text = f"{discarded} unanswered files of an earlier run"
+            reception.alarm("unfinished_files", text)
+        log.info("serving", port=scp.port, left_over=_requeue(reception, received))
+        presence = stack.enter_context(Presence(cases.home, "listener"))
         retention_s = config.listener.retention_days * 86400
-        tending = Tending(record, inbox, intake, retention_s)
-        attempts = stack.enter_context(Attempts(case_dir, "listener"))
-        _loop(intake, scp, tending, received, stop, presence, attempts)
+        tending = Tending(inbox, reception, retention_s)
+        attempts = stack.enter_context(Attempts(cases.home, "listener"))
+        _loop(reception, scp, tending, received, stop, presence, attempts)
 
 
 def _loop(
-    intake: Intake,
+    reception: Reception,
     scp: Scp,
     tending: "Tending",
     received: "SimpleQueue[Path]",
@@ -201,16 +203,18 @@ def _loop(
         if not scp.is_listening:
             raise ListeningEndedError("the thread that listens on the port has ended")
         try:
-            _take_received(intake, received, attempts)
-            intake.look_at_record()
+            if reception.follow():
+                _requeue(reception, received)
+            _take_received(reception, received, attempts)
+            reception.turn()
             while scp.alarms:
-                intake.note_alarm(*scp.alarms.popleft())
+                reception.note_alarm(*scp.alarms.popleft())
             tending.turn()
-        except (sqlite3.Error, OSError) as error:
+        except (CaseRecordError, sqlite3.Error, OSError) as error:
             # The slices are safe in the inbox: tried again until the record can be written.
             log.error("the case record cannot be written", error=str(error))
             stop.wait(_RECORD_RETRY_S)
-            _requeue(intake, received)
+            _requeue(reception, received)
         except Exception:  # receiving and storing go on, whatever the rest of the loop meets
             log.exception("the listener's loop")
             stop.wait(_RECORD_RETRY_S)
@@ -219,10 +223,8 @@ def _loop(
 class Tending:
     """What is looked after now and then, in the listener's own loop: disk and retention."""
 
-    def __init__(
-        self, record: CaseRecord, inbox: Inbox, intake: Intake, retention_s: float
-    ) -> None:
-        self._record, self._inbox, self._intake = record, inbox, intake
+    def __init__(self, inbox: Inbox, reception: Reception, retention_s: float) -> None:
+        self._inbox, self._reception = inbox, reception
         self._retention_s = retention_s
         self._disk_at_s = self._removal_at_s = 0.0
         self._was_low = False
@@ -234,39 +236,43 @@ class Tending:
             self._look_at_disk()
         if now_s >= self._removal_at_s:
             self._removal_at_s = now_s + _REMOVAL_S
-            remove_old(self._record, self._retention_s, time.time())
+            if self._reception.record is not None:
+                remove_old(self._reception.record, self._retention_s, time.time())
 
     def _look_at_disk(self) -> None:
         """Alarm, once, before the disk is so full that slices are refused."""
         free_bytes = self._inbox.free_bytes()
         is_low = free_bytes < 2 * self._inbox.min_free_bytes
         if is_low and not self._was_low:
-            self._intake.alarm("disk_low", f"{free_bytes // _MIB} MiB free")
+            self._reception.alarm("disk_low", f"{free_bytes // _MIB} MiB free")
         self._was_low = is_low
 
 
-def _requeue(intake: Intake, received: "SimpleQueue[Path]") -> None:
-    for path in intake.left_over():
+def _requeue(reception: Reception, received: "SimpleQueue[Path]") -> int:
+    """What has not found its place yet, anew; return how many they are."""
+    left_over = reception.left_over()
+    for path in left_over:
         received.put(path)
+    return len(left_over)
 
 
-def _take_received(intake: Intake, received: "SimpleQueue[Path]", attempts: Attempts) -> None:
+def _take_received(reception: Reception, received: "SimpleQueue[Path]", attempts: Attempts) -> None:
     """Wait for at most one poll, then take whatever is there."""
     try:
         path = received.get(timeout=_POLL_S)
         while True:
-            _take(intake, path, attempts)
+            _take(reception, path, attempts)
             path = received.get_nowait()
     except Empty:
         return
 
 
-def _take(intake: Intake, path: Path, attempts: Attempts) -> None:
+def _take(reception: Reception, path: Path, attempts: Attempts) -> None:
     """One file; one over which the listener was killed again and again is not read any more."""
     deaths = attempts.deaths(path.name)
     if deaths >= MOST_DEATHS:
-        intake.set_aside(path, f"the listener ended {deaths} times while it read this file")
+        reception.set_aside(path, f"the listener ended {deaths} times while it read this file")
         attempts.forget(path.name)
         return
     with attempts.at(path.name):
-        intake.take(path)
+        reception.take(path)

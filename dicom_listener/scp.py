@@ -17,13 +17,23 @@ from typing import Any
 
 import structlog
 from pydicom.dataset import Dataset
-from pynetdicom import AE, evt
+from pynetdicom import AE, _config, evt
+from pynetdicom.association import Association
 from pynetdicom.events import Event
 
 from dicom_listener import inbox as inbox_module
 from dicom_listener.inbox import Envelope, Inbox, InboxError, sha256_of
 from dicom_listener.metrics import ListenerMetrics
-from dicom_listener.negotiation import NegotiationReport, add_contexts, rejection_text, report_of
+from dicom_listener.negotiation import (
+    NegotiationReport,
+    add_contexts,
+    as_storage,
+    contexts_for,
+    rejection_text,
+    report_of,
+)
+from dicom_listener.network.endings import ending_of
+from dicom_listener.network.store_request import mend_store_request, uid_sent_under
 from dicom_listener.transport import BoundedSocket, PromptServer
 from dicom_slice.peek import NoDataSetError, peek
 from room_config.networks import address_of
@@ -37,6 +47,9 @@ _REPORTS_KEPT = 50
 _SAID_AGAIN_AFTER_S = 60.0
 
 log = structlog.get_logger("listener")
+
+# pynetdicom's own accounts of messages fail on what is odd, and keep our handlers from it
+_config.LOG_HANDLER_LEVEL = "none"
 
 
 @dataclass(frozen=True)
@@ -53,7 +66,7 @@ class ScpRules:
     max_associations: int = 16
     acse_timeout_s: float = 10.0
     dimse_timeout_s: float = 30.0
-    network_timeout_s: float = 60.0
+    network_timeout_s: float = 900.0
     max_pdu_bytes: int = 1024 * 1024
     max_object_bytes: int = 512 * 1024 * 1024
     negotiated_pdu_bytes: int = 256 * 1024
@@ -78,6 +91,7 @@ class Scp:
         self.reports: deque[NegotiationReport] = deque(maxlen=_REPORTS_KEPT)
         self.alarms: deque[tuple[str, str]] = deque(maxlen=1000)
         self._said_s: dict[tuple[str, str], float] = {}
+        self._is_stopping = False
         self._ae = self._application_entity()
         self._server: PromptServer = self._ae.make_server(
             (rules.host, rules.port),
@@ -88,6 +102,8 @@ class Scp:
                 (evt.EVT_REJECTED, self._on_rejected),
                 (evt.EVT_C_ECHO, self._on_echo),
                 (evt.EVT_C_STORE, self._on_store),
+                (evt.EVT_DIMSE_RECV, self._on_message),
+                (evt.EVT_SOP_COMMON, self._on_common_extended),
             ],
             server_class=self._server_class(),
         )
@@ -108,6 +124,7 @@ class Scp:
 
     def stop(self) -> None:
         """Stop listening and end every association; idempotent."""
+        self._is_stopping = True
         if self._thread.is_alive():
             self._server.shutdown()
             self._thread.join()
@@ -138,21 +155,36 @@ class Scp:
             "max_pdu_bytes": rules.max_pdu_bytes,
             # one over the limit is still read to its end, so that it can be answered
             "max_message_bytes": 2 * rules.max_object_bytes,
-            "pdu_deadline_s": rules.network_timeout_s,
+            "pdu_deadline_s": rules.dimse_timeout_s,
             "on_refused": staticmethod(lambda why: self._alarm("oversize", why)),
         }
         settings = {
             "socket_class": type("RoomSocket", (BoundedSocket,), bounds),
             "network_timeout_s": rules.network_timeout_s,
+            "message_timeout_s": rules.dimse_timeout_s,
             "first_byte_timeout_s": rules.acse_timeout_s,
             "most_unopened": 4 * rules.max_associations,
             "most_associations": rules.max_associations,
             "is_known": staticmethod(self._is_known),
             "on_dropped": staticmethod(self._on_dropped),
+            "on_ended": staticmethod(self._on_ended),
         }
         return type("RoomServer", (PromptServer,), settings)
 
     # Associations
+
+    def _on_ended(self, association: Association) -> None:
+        ending = ending_of(association)
+        if ending is None or self._is_stopping:
+            return
+        self._metrics.endings.labels(ending.kind).inc()
+        if ending.is_release:
+            log.debug("association ended", text=ending.text)
+        else:
+            self._metrics.alarms.labels("association_ended").inc()
+            log.warning("association_ended", text=ending.text, port=association.requestor.port)
+            if self._is_news("association_ended", ending.text):
+                self.alarms.append(("association_ended", ending.text))
 
     def _on_dropped(self, peer: str, why: str) -> None:
         self._metrics.dropped.inc()
@@ -161,11 +193,24 @@ class Scp:
     def _on_requested(self, event: Event) -> None:
         refusal = self._why_refused(event.assoc)
         if refusal is None:
+            self._add_contexts(event.assoc)
             return
         code, why = refusal
         event.assoc.acse.send_reject(*code)
         self._reject(report_of(event.assoc, why))
         event.assoc.kill()
+
+    def _add_contexts(self, association: Association) -> None:
+        """Private and retired kinds are stored, too: the transfer must not stop at them."""
+        if not self._rules.any_storage_class:
+            return
+        acceptor = association.acceptor
+        more = contexts_for(_proposed(association), acceptor.supported_contexts)
+        if more:
+            acceptor.supported_contexts = [*acceptor.supported_contexts, *more]
+
+    def _on_common_extended(self, event: Event) -> dict[Any, Any]:
+        return {**as_storage(_proposed(event.assoc)), **event.items}
 
     def _is_known(self, peer: str) -> bool:
         """Whether the address may send; one that cannot be told may not keep others out either."""
@@ -212,6 +257,20 @@ class Scp:
 
     # Messages
 
+    def _on_message(self, event: Event) -> None:
+        """Before pynetdicom makes anything of it, in its thread."""
+        association, message = event.assoc, event.message
+        try:
+            context = association._accepted_cx.get(message.context_id)
+            syntax = str(context.transfer_syntax[0]) if context else ""
+            mend_store_request(message, syntax)
+            message.message_to_primitive()
+        except Exception as error:
+            association.dul.socket.note_ending(
+                "unreadable", f"a message that cannot be read: {error}"
+            )
+            association.dul.event_queue.put("Evt19")
+
     def _on_echo(self, event: Event) -> int:
         self._metrics.echoes.inc()
         event.assoc.dul.socket.message_done()
@@ -256,7 +315,7 @@ class Scp:
             received_monotonic_s=received_monotonic_s,
             transfer_syntax_uid=transfer_syntax,
             sop_class_uid=sop_class,
-            sop_instance_uid=str(request.AffectedSOPInstanceUID or ""),
+            sop_instance_uid=uid_sent_under(request.AffectedSOPInstanceUID, peeked),
             sha256=sha256_of(data_set),
             size_bytes=len(data_set),
         )
@@ -287,6 +346,10 @@ class Scp:
             self._said_s.clear()
         self._said_s[kind, text] = now_s
         return True
+
+
+def _proposed(association: Association) -> list[Any]:
+    return list(association.requestor.primitive.presentation_context_definition_list)
 
 
 def _failure(status: int, comment: str) -> Dataset:

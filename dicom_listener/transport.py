@@ -17,15 +17,20 @@ from collections.abc import Callable
 from socketserver import TCPServer
 from typing import Any
 
+from pynetdicom import evt
 from pynetdicom.association import Association
+from pynetdicom.events import Event
+from pynetdicom.pdu import A_ABORT_RQ
 from pynetdicom.timer import Timer
 from pynetdicom.transport import AssociationSocket, RequestHandler, ThreadedAssociationServer
 
 from dicom_listener.lobby import Lobby, NoRequestError, await_request
+from dicom_listener.network.association_request import ASSOCIATE_RQ, mended_request
 
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)
 _CHUNK_BYTES = 256 * 1024
 _MAY_BE_SILENT_S = 2.0
+_ABORT = 0x07
 
 
 def acknowledge_at_once(sock: socket.socket) -> None:
@@ -43,18 +48,27 @@ class BoundedSocket(AssociationSocket):
     max_pdu_bytes = 2**20
     max_message_bytes = 2**30
     pdu_deadline_s = 60.0
+    remarks: tuple[str, ...] = ()  # what was put right in the association request
     on_refused: Callable[[str], None] = staticmethod(lambda why: None)
 
     def __init__(self, assoc: Association, client_socket: socket.socket) -> None:
         super().__init__(assoc, client_socket=client_socket)
         self.message_bytes = 0
+        self.unfinished_bytes = 0
         self.message_began_s: float | None = None
         self.heard_s = time.monotonic()
+        self.why_ended: tuple[str, str] | None = None  # (kind, in words)
+        self.is_accounted_for = False
+
+    def note_ending(self, kind: str, why: str) -> None:
+        """Say why the association is about to end; what was seen first is the cause."""
+        if self.why_ended is None:
+            self.why_ended = kind, why
 
     def message_done(self) -> float | None:
         """Start counting anew; return the monotonic instant of the message's first byte."""
         began_s, self.message_began_s = self.message_began_s, None
-        self.message_bytes = 0
+        self.message_bytes = self.unfinished_bytes = 0
         return began_s
 
     def recv(self, nr_bytes: int) -> bytearray:
@@ -67,15 +81,27 @@ class BoundedSocket(AssociationSocket):
         received = bytearray()
         deadline_s = time.monotonic() + self.pdu_deadline_s
         while len(received) < nr_bytes:
-            piece = sock.recv(min(_CHUNK_BYTES, nr_bytes - len(received)))
+            piece = self._next_piece(sock, nr_bytes - len(received))
             if not piece:
+                self.note_ending("closed", "the sender closed the connection without a release")
                 break
             acknowledge_at_once(sock)
+            self.unfinished_bytes += len(piece)
             self.heard_s = time.monotonic()
             received += piece
             if len(received) < nr_bytes and time.monotonic() > deadline_s:
                 self._refuse(f"a PDU took longer than {self.pdu_deadline_s:g} s")
         return received
+
+    def _next_piece(self, sock: socket.socket, nr_bytes: int) -> bytes:
+        try:
+            return sock.recv(min(_CHUNK_BYTES, nr_bytes))
+        except TimeoutError:
+            self.note_ending("stalled", f"nothing more came of a PDU for {sock.gettimeout():g} s")
+            raise
+        except OSError as error:
+            self.note_ending("broken", f"the connection broke ({error.strerror or error})")
+            raise
 
     def _shutdown_socket(self) -> None:
         """Close in any case. (pynetdicom's own leaves it open where the peer is gone already.)"""
@@ -92,6 +118,7 @@ class BoundedSocket(AssociationSocket):
             self._refuse(f"a message of more than {self.max_message_bytes} bytes")
 
     def _refuse(self, why: str) -> None:
+        self.note_ending("over_limit", why)
         self.on_refused(why)
         raise OSError(why)
 
@@ -129,18 +156,98 @@ class SharedContexts(list[Any]):
         return self
 
 
+class PatienceTimer(SteadyTimer):
+    """How long nothing may come: minutes between messages, much less in the middle of one."""
+
+    def __init__(self, sock: BoundedSocket, between_s: float, within_s: float) -> None:
+        super().__init__(between_s)
+        self._sock, self._between_s, self._within_s = sock, between_s, within_s
+
+    @property
+    def timeout(self) -> float | None:
+        if self._sock.message_began_s is None:
+            return self._between_s
+        return min(self._within_s, self._between_s)
+
+    @timeout.setter
+    def timeout(self, value: float | None) -> None:
+        pass  # both are given
+
+    @property
+    def expired(self) -> bool:
+        is_over = super().expired
+        if is_over:
+            self._sock.note_ending("idle", f"nothing came for {self.timeout:g} s")
+        return is_over
+
+
 class PromptRequestHandler(RequestHandler):
     server: "PromptServer"
 
     def _create_association(self) -> Association:
         association = super()._create_association()
+        dul, server = association.dul, self.server
         # The plain socket has announced the connection (Evt5); ours announces it itself.
-        association.dul.event_queue.get_nowait()
-        bounded = self.server.socket_class(association, self.request)
-        association.dul.socket = bounded
-        association.dul._idle_timer = SteadyTimer(association.network_timeout)
-        association.dul.artim_timer = SteadyTimer(association.acse_timeout)
+        dul.event_queue.get_nowait()
+        bounded = server.socket_class(association, self.request)
+        dul.socket = bounded
+        dul._idle_timer = PatienceTimer(bounded, server.network_timeout_s, server.message_timeout_s)
+        dul.artim_timer = SteadyTimer(association.acse_timeout)
+
+        def account() -> None:
+            server.on_ended(association)
+
+        dul._decode_pdu = _tolerant(dul._decode_pdu, bounded, account)
+        association.run = _accounted(association.run, account)
+        association.bind(evt.EVT_PDU_SENT, _stop_waiting)
         return association
+
+
+def _tolerant(
+    decode: Callable[[bytearray], Any], sock: BoundedSocket, account: Callable[[], None]
+) -> Callable[..., Any]:
+    """pynetdicom's decoding of a PDU, which says why where it cannot, and takes what DCMTK takes.
+
+    What cannot be converted is found here, too: later, it would end the thread and nothing else.
+    The account is given at once: the thread may wait for a while for the peer to go.
+    """
+
+    def decode_tolerantly(stream: bytearray) -> Any:
+        try:
+            if stream[0] == ASSOCIATE_RQ:
+                mended = mended_request(bytes(stream))
+                sock.remarks = tuple(mended.remarks)
+                stream = bytearray(mended.pdu)
+            pdu, event = decode(stream)
+            if stream[0] == ASSOCIATE_RQ:
+                pdu.to_primitive()
+            if stream[0] == _ABORT:
+                sock.note_ending("aborted", "aborted by the sender")
+        except Exception as error:
+            sock.note_ending("unreadable", f"a PDU that cannot be read: {error}")
+            account()
+            raise
+        return pdu, event
+
+    return decode_tolerantly
+
+
+def _stop_waiting(event: Event) -> None:
+    """Where the request was answered by an abort, the association need not wait for it any more."""
+    if isinstance(event.pdu, A_ABORT_RQ) and event.assoc.requestor.primitive is None:
+        event.assoc.dul.to_user_queue.put(None)
+
+
+def _accounted(run: Callable[[], None], account: Callable[[], None]) -> Callable[[], None]:
+    """The thread of an association, and the account of it when it ends, however it does."""
+
+    def run_to_the_end() -> None:
+        try:
+            run()
+        finally:
+            account()
+
+    return run_to_the_end
 
 
 class PromptServer(ThreadedAssociationServer):
@@ -150,12 +257,14 @@ class PromptServer(ThreadedAssociationServer):
     block_on_close = False
     request_queue_size = 128
     socket_class: type[BoundedSocket] = BoundedSocket
-    network_timeout_s = 60.0
+    network_timeout_s = 900.0
+    message_timeout_s = 30.0
     first_byte_timeout_s = 10.0
     most_unopened = 64
     most_associations = 16
     is_known: Callable[[str], bool] = staticmethod(lambda peer: True)
     on_dropped: Callable[[str, str], None] = staticmethod(lambda peer, why: None)
+    on_ended: Callable[[Association], None] = staticmethod(lambda association: None)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._lobby = Lobby(self.most_unopened)
@@ -197,7 +306,7 @@ class PromptServer(ThreadedAssociationServer):
                 _wait_readable(sock, self.first_byte_timeout_s)
             else:
                 await_request(sock, self.first_byte_timeout_s)
-            sock.settimeout(self.network_timeout_s)
+            sock.settimeout(self.message_timeout_s)
         except NoRequestError as error:
             self.on_dropped(peer, str(error))
             self.shutdown_request(sock)
@@ -217,7 +326,7 @@ class PromptServer(ThreadedAssociationServer):
         longest = max(silent, key=lambda a: silent[a])
         if silent[longest] < _MAY_BE_SILENT_S:
             return  # all of them are at work: the new one is refused, and says so
-        self.on_dropped(longest.requestor.address, f"silent, and {peer} wants in")
+        longest.dul.socket.note_ending("made_room", f"silent, and {peer} wants in")
         with contextlib.suppress(Exception):  # it may end by itself in this very moment
             longest.abort()
 

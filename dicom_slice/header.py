@@ -17,7 +17,7 @@ from dicom_slice import quirks
 from dicom_slice.bounds import check_bounds
 from dicom_slice.elements import Elements, FrameElements, frame_elements
 from dicom_slice.geometry import SliceGeometry
-from dicom_slice.patient import patient_digest
+from dicom_slice.patient import Identity, patient_digest
 from dicom_slice.quirks import Kind
 from dicom_slice.reasons import Reason, UnusableError
 from dicom_slice.times import (
@@ -90,6 +90,11 @@ class Slice:
         """Grows from one acquisition of a study to the next; (-1, -1) where nothing is numbered."""
         series = -1 if self.series_number is None else self.series_number
         return (series, -1 if self.acquisition_number is None else self.acquisition_number)
+
+    @property
+    def identity(self) -> Identity:
+        """Whom it shows, without who that is."""
+        return Identity(self.patient_digest, self.study_instance_uid, self.frame_of_reference_uid)
 
 
 def read_header(path: Path, times: TimeFrame = _NO_TIME_FRAME) -> list[Slice]:

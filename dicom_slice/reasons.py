@@ -50,6 +50,11 @@ class Reason(StrEnum):
     OTHER_PATIENT = "other_patient"
     OTHER_STUDY = "other_study"
     OTHER_FRAME = "other_frame_of_reference"
+    # Why it waits in the holding area, besides
+    NO_CASE = "no_case_open"
+    OTHER_CASE = "other_case"
+    UNKNOWN_STUDY = "unknown_study"
+    NO_SLICE_USED = "no_slice_used_yet"
 
 
 @dataclass(frozen=True)

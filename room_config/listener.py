@@ -29,7 +29,10 @@ class ListenerConfig(Section):
     acse_timeout_s: float = Field(default=10.0, gt=0, description="To open an association.")
     dimse_timeout_s: float = Field(default=30.0, gt=0, description="Between parts of a message.")
     network_timeout_s: float = Field(
-        default=60.0, gt=0, description="An association on which nothing arrives is ended."
+        default=900.0,
+        gt=0,
+        description="An association on which nothing arrives between messages is ended: longer "
+        "than scanners pause that keep one open.",
     )
     max_object_mib: int = Field(default=512, ge=1, description="Largest object that is stored.")
     min_free_mib: int = Field(

@@ -4,6 +4,7 @@ Every instant here is on the scanner's clock (seconds since the epoch); it write
 time, as scanners do.
 """
 
+import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta, timezone
@@ -38,6 +39,21 @@ class Study:
     @classmethod
     def new(cls, started_s: float) -> "Study":
         return cls(generate_uid(), generate_uid(), generate_uid(), started_s)
+
+    @classmethod
+    def of_examination(cls, case_uid: str, table: str, started_s: float) -> "Study":
+        """The same for the same case and table: a scanner that was restarted goes on with it.
+
+        A table that was moved begins another study, and a frame of reference, of the same patient.
+        """
+        patient = hashlib.sha256(case_uid.encode()).hexdigest()[:8].upper()
+        study, frame, dimensions = (
+            generate_uid(entropy_srcs=[what, case_uid, table])
+            for what in ("study", "frame of reference", "dimensions")
+        )
+        return cls(
+            study, frame, dimensions, started_s, f"VIRTUAL-{patient}", f"Phantom^{patient.title()}"
+        )
 
 
 @dataclass(frozen=True)

@@ -46,7 +46,10 @@ def read_request(http: httpx.Client, service_url: str) -> AcquisitionRequest | N
     if state["acquisition_request"] is None:
         return None
     try:
-        return AcquisitionRequest.model_validate(state["acquisition_request"])
+        wanted = {**state["acquisition_request"], "case_uid": state.get("case_uid", "")}
+        return AcquisitionRequest.model_validate(wanted)
+    except TypeError:
+        raise ValueError("acquisition_request is not an object") from None
     except ValidationError as error:
         first = error.errors(include_url=False)[0]
         key = ".".join(str(part) for part in first["loc"])

@@ -38,6 +38,7 @@ class AcquisitionRequest(BaseModel):
     hold_id: int | None = None
     count: int = Field(default=1, ge=1, le=1000)
     slice_position_mm: float | None = Field(default=None, allow_inf_nan=False)
+    case_uid: str = ""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,8 +74,9 @@ class VirtualScanner:
         self._switched_on_s = time.time()
         self._jump_s = 0.0
         self._study = Study.new(self.clock_s(self._switched_on_s))
-        self._acquisitions = 0
-        self._series = 0
+        self._case_uid = ""
+        # a scanner that was restarted goes on counting: each acquisition has left a line, and more
+        self._acquisitions = self._series = truth.earlier_lines
         self._last_stage_mm: dict[str, float] | None = None
         self._held_back: list[Dataset] = []
         self._held_back_since_s = 0.0
@@ -86,6 +88,7 @@ class VirtualScanner:
 
     def serve(self, request: AcquisitionRequest, stop: threading.Event) -> None:
         """Acquire the slices that were asked for, one series; raises TruthError."""
+        self._examine(request.case_uid)
         series = self._new_series("fl2d_cor_guide", ("M", "ND", "NORM"))
         for index in range(request.count):
             if index:
@@ -94,6 +97,15 @@ class VirtualScanner:
             if stop.is_set():
                 return
             self._send(scan, series)
+
+    def _examine(self, case_uid: str) -> None:
+        """Each case is an examination of a patient of its own."""
+        if not case_uid or case_uid == self._case_uid:
+            return
+        self._case_uid = case_uid
+        table = str(self._room.placement.origin_mm)
+        started_s = self.clock_s(time.time())
+        self._study = Study.of_examination(case_uid, table, started_s)
 
     def scan_if_moving(self, stop: threading.Event) -> bool:
         """With the fault: acquire unasked if the robot is just moving; whether it did so."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import resource
 import signal
 import socket
 import sys
@@ -43,6 +44,7 @@ def _serve(room: Config, cases: Cases, exit_with_parent: bool) -> None:
     from service.room.control import ControlLoop
     from service.slicer.server import OpenIgtLinkServer, bind_openigtlink
     from service.web.app import create_app
+    from service.web.connections import PatientProtocol
 
     check_device(room.service.bridge_link)
     listening = bind(room)
@@ -72,11 +74,14 @@ def _serve(room: Config, cases: Cases, exit_with_parent: bool) -> None:
         scene=None if followers is None else scene,
         on_failure=end_failed,
     )
+    most_files = resource.getrlimit(resource.RLIMIT_NOFILE)[1]
+    resource.setrlimit(resource.RLIMIT_NOFILE, (most_files, most_files))
     # the control loop must not wait long for the interpreter while a page is being served
     sys.setswitchinterval(_SWITCH_INTERVAL_S)
     server = uvicorn.Server(
         uvicorn.Config(
             app,
+            http=PatientProtocol,
             log_level="warning",
             access_log=False,
             server_header=False,

@@ -12,8 +12,9 @@ from PIL import Image
 
 from case_record.record import CaseRecord
 from dicom_slice.pixels import magnitude_pixels
-from dicom_slice.reasons import UnusableError
+from dicom_slice.reasons import Reason, UnusableError
 
+_MOST_SIDE_PX = 4096
 _WINDOW_PERCENT = (1.0, 99.8)
 
 
@@ -33,6 +34,8 @@ class Rendering:
 def slice_pixels(record: CaseRecord, slice_id: int) -> NDArray[np.float64]:
     """Return the magnitudes of a slice (rows, cols); raises ImageMissingError."""
     row = record.slice(slice_id)
+    if row.reason_code == Reason.TOO_LARGE:
+        raise ImageMissingError(f"slice {slice_id} is not shown: {row.reason}")
     try:
         return magnitude_pixels(record.case_dir / row.path, row.frame)
     except (UnusableError, OSError) as error:
@@ -64,8 +67,9 @@ def png_of(pixels: NDArray[np.floating], how: Rendering = Rendering()) -> bytes:
     level = how.level if how.level is not None else (high + low) / 2
     scaled = np.clip((pixels - level) / max(window, 1e-12) + 0.5, 0.0, 1.0)
     grey = np.round(scaled * 255).astype(np.uint8)
-    if how.scale > 1:
-        grey = grey.repeat(how.scale, axis=0).repeat(how.scale, axis=1)
+    scale = min(how.scale, max(1, _MOST_SIDE_PX // max(grey.shape)))
+    if scale > 1:
+        grey = grey.repeat(scale, axis=0).repeat(scale, axis=1)
     buffer = io.BytesIO()
     Image.fromarray(grey).save(buffer, "PNG")
     return buffer.getvalue()

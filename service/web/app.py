@@ -31,6 +31,7 @@ from service.web.event_stream import Broadcast
 from service.web.metrics import Receivers, RoomMetrics
 from service.web.orders import Orders
 from service.web.problems import Problem, add_problems, problem, responses
+from service.web.readers import Readers
 from service.web.request_guard import Gate
 from service.web.routes.access import access_router
 from service.web.routes.documents import document_router
@@ -92,6 +93,8 @@ def create_app(
             await asyncio.to_thread(broadcast.close)
             await asyncio.to_thread(loop.close)
             await asyncio.to_thread(outbox.close)
+            for end in ending:
+                end()
 
     app = FastAPI(
         title="AutoSPINe Navigator",
@@ -104,6 +107,8 @@ def create_app(
     )
     uses_tls = service.tls_certificate is not None
     access = Access(access_rules(config))
+    ending: list[Callable[[], None]] = []
+    app.add_middleware(Readers, config=config, stopping=ending)
     app.add_middleware(Gate, access=access, uses_tls=uses_tls, public_url=service.public_url)
     add_problems(app)
     app.state.cases = Cases(*config.room.folders)

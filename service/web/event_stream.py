@@ -25,6 +25,8 @@ from service.room.control import ControlLoop
 
 _WATCH_S = 0.01
 _LEAST_BETWEEN_STATES_S = 0.04
+_FOR_EACH_VIEWER_S = 0.004
+MOST_VIEWERS = 100
 _BEAT_S = 0.3
 _AGAIN_S = 1.0
 _KEPT_EVENTS = 1000
@@ -88,7 +90,8 @@ class Broadcast:
                 if events:
                     self._newest_id = events[-1].event_id
                 self._tell(_state_message(state.model_dump_json()), messages)
-                self._closing.wait(_LEAST_BETWEEN_STATES_S)
+                # many viewers cost no more than a few: each is told less often
+                self._closing.wait(_LEAST_BETWEEN_STATES_S + self.viewers * _FOR_EACH_VIEWER_S)
 
     def _beat_if_due(self) -> None:
         """Tells how old the state is: a control loop that hangs is noticed on every screen."""

@@ -7,6 +7,7 @@ through: from viewers, without CSRF token, during a lock-out; only a caller that
 
 from __future__ import annotations
 
+import asyncio
 import time
 from http.cookies import CookieError, SimpleCookie
 
@@ -24,6 +25,7 @@ COOKIE = "autospine_session"
 STOP_PATH = "/api/v1/stop"
 SESSION_PATH = "/api/v1/session"
 _MOST_BODY_BYTES = 64 * 1024
+_BODY_PATIENCE_S = 10.0
 _SAFE = frozenset({"GET", "HEAD", "OPTIONS"})
 _PUBLIC = frozenset({"/", "/healthz"})
 
@@ -66,7 +68,12 @@ class Gate:
         try:
             self._let_in(scope)
             if scope["method"] not in _SAFE:
-                receive = await _bounded(Headers(scope=scope), receive)
+                async with asyncio.timeout(_BODY_PATIENCE_S):
+                    receive = await _bounded(Headers(scope=scope), receive)
+        except TimeoutError:
+            text = f"The body did not come within {_BODY_PATIENCE_S:.0f} s."
+            await problem(408, "slow_body", text)(scope, receive, send)
+            return
         except ProblemError as error:
             answer: Response = problem(
                 error.status, error.code, error.detail, headers=error.headers

@@ -10,8 +10,8 @@ from dicom_listener.belonging import (
     ACCEPTED,
     BOUND,
     Binding,
-    binding_of,
-    bound_body,
+    after_event,
+    event_body,
     why_not_of,
 )
 from dicom_listener.clock import OffsetBounds
@@ -58,19 +58,16 @@ def test_another_ones_slice_is_set_aside_with_the_reason(changes, code):
 
 def test_a_person_can_say_that_a_further_study_belongs_to_the_case():
     split = replace(FIRST, study_instance_uid="9", frame_of_reference_uid="8")
-    events = [
-        (BOUND, bound_body(FIRST)),
-        (ACCEPTED, {"study": "9", "frame_of_reference": "8"}),
-    ]
-    binding = binding_of(events)
+    binding = after_event(None, BOUND, event_body(FIRST.identity))
+    binding = after_event(binding, ACCEPTED, event_body(split.identity))
     assert isinstance(decided(split, binding), Assigned)
     # the table was moved: what comes late of before is in the way of it
-    assert why_not_of(binding, FIRST).code == Reason.OTHER_FRAME
+    assert why_not_of(binding, FIRST.identity).code == Reason.OTHER_FRAME
 
 
 def test_an_unbound_case_takes_any():
-    assert binding_of([]) is None
-    assert why_not_of(None, FIRST) is None
+    assert after_event(None, ACCEPTED, event_body(FIRST.identity)) is None
+    assert why_not_of(None, FIRST.identity) is None
 
 
 def test_patients_are_told_apart_and_not_named():
@@ -96,4 +93,4 @@ def test_a_record_from_before_is_read_without_it():
     assert slice_from_record(header) == FIRST
     del header["patient_digest"]
     assert slice_from_record(header) == replace(FIRST, patient_digest="")
-    assert Binding.of_slice(slice_from_record(header)).patient == ""
+    assert Binding.to(slice_from_record(header).identity).patient == ""

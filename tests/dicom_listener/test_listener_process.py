@@ -88,7 +88,7 @@ def test_a_slice_acquired_at_the_standing_hold_is_assigned_and_its_pixels_can_be
     assert magnitude_pixels(path, row.frame).shape == (48, 40)
     assert slice_from_record(row.header) == read_header(path)[0]
     assert row.header["envelope"]["calling_ae_title"] == "SCANNER"
-    assert [event.kind for event in record.events()] == ["slice_received"]
+    assert [event.kind for event in record.events()] == ["slice_received", "case_bound"]
     record.verify_events()
 
 

@@ -9,7 +9,7 @@ from fastapi.responses import StreamingResponse
 
 from service.room.control import STALE_S, ControlLoop
 from service.room.state import RoomState
-from service.web.event_stream import Broadcast
+from service.web.event_stream import MOST_VIEWERS, Broadcast
 from service.web.pagination import (
     ERRORS,
     MOST_ID,
@@ -46,6 +46,9 @@ def live_router(loop: ControlLoop, broadcast: Broadcast) -> APIRouter:
         last_event_id: Annotated[str | None, Header(alias="Last-Event-ID")] = None,
     ) -> StreamingResponse:
         """The state whenever it changes, every event of the record after the given one."""
+        if broadcast.viewers >= MOST_VIEWERS:
+            wait = {"Retry-After": "5"}
+            raise ProblemError(429, "busy", f"{MOST_VIEWERS} are looking on already.", wait)
         if last_event_id is not None and last_event_id.isdecimal():
             after = min(int(last_event_id), MOST_ID)
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
