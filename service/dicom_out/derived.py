@@ -20,40 +20,75 @@ from pydicom.valuerep import format_number_as_ds
 from dicom_slice.geometry import SliceGeometry
 from sr_engine.reconstruction.reconstruct import Reconstruction
 
-# what the derived image shares with its sources
+# What the derived image shares with its sources. Of patient and study: everything, for objects of
+# one study must not contradict each other. Of the series: what says which body part lies how.
+SERIES_SHARED = ("BodyPartExamined", "Laterality", "PatientPosition", "ProtocolName")
 _KEPT = (
     "SpecificCharacterSet",
-    "StudyDate",
-    "StudyTime",
-    "AccessionNumber",
-    "ReferringPhysicianName",
-    "StudyDescription",
+    # patient
     "PatientName",
     "PatientID",
+    "IssuerOfPatientID",
     "PatientBirthDate",
+    "PatientBirthTime",
     "PatientSex",
+    "OtherPatientIDs",
+    "OtherPatientIDsSequence",
+    "OtherPatientNames",
+    "EthnicGroup",
+    "PatientComments",
+    "PatientIdentityRemoved",
+    "DeidentificationMethod",
+    "DeidentificationMethodCodeSequence",
+    # study
     "StudyInstanceUID",
+    "StudyDate",
+    "StudyTime",
     "StudyID",
+    "AccessionNumber",
+    "IssuerOfAccessionNumberSequence",
+    "ReferringPhysicianName",
+    "StudyDescription",
+    "PhysiciansOfRecord",
+    "ProcedureCodeSequence",
+    "AdmittingDiagnosesDescription",
+    "PatientAge",
+    "PatientSize",
+    "PatientWeight",
+    "MedicalAlerts",
+    "Allergies",
+    "SmokingStatus",
+    "PregnancyStatus",
+    "Occupation",
+    "AdditionalPatientHistory",
+    "PatientState",
+    # series, frame of reference, place, acquisition
+    *SERIES_SHARED,
     "FrameOfReferenceUID",
     "PositionReferenceIndicator",
-    "PatientPosition",
     "SliceThickness",
+    "SpacingBetweenSlices",
+    "SliceLocation",
     "ScanningSequence",
     "SequenceVariant",
+    "SequenceName",
     "ScanOptions",
     "MRAcquisitionType",
     "RepetitionTime",
     "EchoTime",
+    "InversionTime",
     "EchoTrainLength",
+    "FlipAngle",
     "MagneticFieldStrength",
+    "ImagedNucleus",
     "ImagingFrequency",
-    "Laterality",
 )
 _MUST_BE_THERE = ("PatientName", "PatientID", "PatientBirthDate", "PatientSex", "StudyID",
                   "StudyDate", "StudyTime", "AccessionNumber", "ReferringPhysicianName",
                   "PositionReferenceIndicator", "RepetitionTime", "EchoTime", "EchoTrainLength",
                   "ScanOptions", "MRAcquisitionType")  # fmt: skip
-_FULL_SCALE = 4095
+# grey values go up to so much: 16 bits with a sign, for the ringing below zero
+_LEAST_PEAK, _MOST_PEAK = 1000.0, 32000.0
 
 
 def derived_image(
@@ -70,6 +105,8 @@ def derived_image(
     for keyword, value in (("ScanningSequence", "RM"), ("SequenceVariant", "NONE")):
         if keyword not in derived:
             setattr(derived, keyword, value)
+    if not derived.get("BodyPartExamined") and "Laterality" not in derived:
+        derived.Laterality = None  # may be of a paired part: unknown, but there
     _add_identity(derived, made, first)
     _add_geometry(derived, geometry)
     _add_sources(derived, made, sources)
@@ -126,20 +163,27 @@ def _add_sources(derived: Dataset, made: Reconstruction, sources: Sequence[Path]
 
 
 def _add_pixels(derived: Dataset, made: Reconstruction) -> None:
-    """Twelve bits over the whole range; ringing below zero is kept by the intercept."""
-    low, high = float(made.image.min()), float(made.image.max())
-    slope = max(high - low, 1e-12) / _FULL_SCALE
-    stored = np.round((made.image - low) / slope).astype("<u2")
+    """The sources' grey values as they are, so that they read the same with and without a rescale;
+    of very dark or bright ones by a power of ten, which is said.
+    """
+    peak = float(np.abs(made.image).max())
+    power = 0 if _LEAST_PEAK <= peak <= _MOST_PEAK or peak == 0 else _power_for(peak)
+    scaled = made.image * 10.0**power
+    if power:
+        derived.DerivationDescription += f"; grey values times 1e{power}"
+    low, high = float(scaled.min()), float(scaled.max())
+    stored = np.round(scaled).astype("<i2")
     derived.SamplesPerPixel = 1
     derived.PhotometricInterpretation = "MONOCHROME2"
     derived.Rows, derived.Columns = stored.shape
     derived.BitsAllocated = 16
-    derived.BitsStored = 12
-    derived.HighBit = 11
-    derived.PixelRepresentation = 0
-    derived.RescaleSlope = format_number_as_ds(slope)
-    derived.RescaleIntercept = format_number_as_ds(low)
-    derived.RescaleType = "US"
+    derived.BitsStored = 16
+    derived.HighBit = 15
+    derived.PixelRepresentation = 1
     derived.WindowCenter = format_number_as_ds((low + high) / 2)
-    derived.WindowWidth = format_number_as_ds(max(high - low, 1e-6))
+    derived.WindowWidth = format_number_as_ds(max(high - low, 1.0))
     derived.PixelData = stored.tobytes()
+
+
+def _power_for(peak: float) -> int:
+    return int(np.floor(np.log10(_MOST_PEAK / peak)))

@@ -52,6 +52,7 @@ class Finding:
     files: tuple[Path, ...]
     must_be_plane_mm: NDArray[np.float64] | None
     distance: Distance | None
+    case_created_s: float = 0.0
     arrival: Procedure | None = None
     puncture: Event | None = None
 
@@ -98,6 +99,7 @@ def finding_of_measurement(record: CaseRecord, measurement_id: int) -> Finding:
     return Finding(
         case_dir=record.case_dir,
         case_uid=case.case_uid,
+        case_created_s=case.created_s,
         measurement=row,
         result=row.result,
         slices=slices,

@@ -25,9 +25,10 @@ def output_uid(finding: Finding, *words: str) -> UID:
     return generate_uid(entropy_srcs=[finding.case_uid, *words])
 
 
-def series_uid(finding: Finding, kind: str, study_uid: str, frame_of_reference_uid: str) -> UID:
-    """One series a kind, study and frame of reference."""
-    return output_uid(finding, "series", kind, study_uid, frame_of_reference_uid)
+def series_uid(finding: Finding, kind: str, dataset: Dataset, *words: str) -> UID:
+    """One series a kind, study, frame of reference, and whatever else is the series'."""
+    study, frame = str(dataset.StudyInstanceUID), str(dataset.get("FrameOfReferenceUID", ""))
+    return output_uid(finding, "series", kind, study, frame, software_version(), *words)
 
 
 def subject_of(finding: Finding) -> tuple[str, int]:
@@ -49,17 +50,22 @@ def instant_s(finding: Finding) -> float:
 
 
 def stamp(dataset: Dataset, finding: Finding, kind: str, description: str) -> None:
-    """Instants, series and equipment; whatever the clock said while the object was made."""
+    """Instants, series and equipment; whatever the clock said while the object was made.
+
+    A report is a series of its own, with its own instant and description (which is what archives
+    list). Objects of other kinds share a series, so that what is the series' is the case's.
+    """
     made = datetime.fromtimestamp(instant_s(finding))
-    date, time = made.strftime("%Y%m%d"), made.strftime("%H%M%S.%f")
-    for name in ("SeriesDate", "ContentDate", "InstanceCreationDate"):
-        setattr(dataset, name, date)
-    for name in ("SeriesTime", "ContentTime", "InstanceCreationTime"):
-        setattr(dataset, name, time)
+    begun = made if kind == "report" else datetime.fromtimestamp(finding.case_created_s)
+    for name, at in (("Series", begun), ("Content", made), ("InstanceCreation", made)):
+        setattr(dataset, f"{name}Date", at.strftime("%Y%m%d"))
+        setattr(dataset, f"{name}Time", at.strftime("%H%M%S.%f"))
     for equipment in dataset.get("ContributingEquipmentSequence") or ():
         if "ContributionDateTime" in equipment:
-            equipment.ContributionDateTime = date + time
+            equipment.ContributionDateTime = made.strftime("%Y%m%d%H%M%S.%f")
     dataset.SeriesNumber = SERIES_NUMBERS[kind]
+    if kind == "report":
+        dataset.SeriesNumber = 10_000 * SERIES_NUMBERS[kind] + int(dataset.InstanceNumber)
     dataset.SeriesDescription = description[:_DESCRIPTION_CHARACTERS]
     dataset.Manufacturer = MAKER
     dataset.ManufacturerModelName = MAKER

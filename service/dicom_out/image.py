@@ -6,7 +6,7 @@ import numpy as np
 from pydicom.dataset import Dataset
 
 from dicom_slice.geometry import SliceGeometry
-from service.dicom_out.derived import derived_image
+from service.dicom_out.derived import SERIES_SHARED, derived_image
 from service.dicom_out.errors import OutputError
 from service.dicom_out.finding import Finding
 from service.dicom_out.identity import output_uid, series_uid, stamp
@@ -31,8 +31,9 @@ def image_of(finding: Finding) -> Dataset:
     name = f"measurement-{number}-image"
     dataset.SOPInstanceUID = output_uid(finding, name)
     dataset.file_meta.MediaStorageSOPInstanceUID = dataset.SOPInstanceUID
-    words = (str(dataset.StudyInstanceUID), str(dataset.get("FrameOfReferenceUID", "")))
-    dataset.SeriesInstanceUID = series_uid(finding, "image", *words)
+    of_the_series = [str(dataset.get(keyword, "")) for keyword in SERIES_SHARED]
+    words = (str(made.factor), *of_the_series)
+    dataset.SeriesInstanceUID = series_uid(finding, "image", dataset, *words)
     dataset.InstanceNumber = number
     stamp(dataset, finding, "image", f"AutoSPINe super-resolution x{made.factor} (research)")
     return dataset

@@ -72,10 +72,9 @@ def presentation_of(finding: Finding) -> Dataset:
     drawing = _drawing(finding)
     subject, number = subject_of(finding)
     image = drawing.image
-    words = (str(image.StudyInstanceUID), str(image.get("FrameOfReferenceUID", "")))
     made = GrayscaleSoftcopyPresentationState(
         referenced_images=[image],
-        series_instance_uid=series_uid(finding, "presentation", *words),
+        series_instance_uid=series_uid(finding, "presentation", image),
         series_number=SERIES_NUMBERS["presentation"],
         sop_instance_uid=output_uid(finding, f"{subject}-{number}-presentation"),
         instance_number=10 * number + ("measurement", "approach", "puncture").index(subject),
@@ -89,7 +88,10 @@ def presentation_of(finding: Finding) -> Dataset:
         graphic_annotations=list(_annotations(finding, drawing)),
         transfer_syntax_uid=ExplicitVRLittleEndian,
     )
-    stamp(made, finding, "presentation", f"AutoSPINe {subject} {number} overlay (research)")
+    for keyword in ("BodyPartExamined", "Laterality"):
+        if keyword in image:
+            made[keyword] = image[keyword]
+    stamp(made, finding, "presentation", "AutoSPINe overlays (research)")
     made.PresentationCreationDate, made.PresentationCreationTime = (
         made.ContentDate,
         made.ContentTime,

@@ -59,7 +59,7 @@ def report_of(finding: Finding) -> Dataset:
     made = Comprehensive3DSR(
         evidence=evidence,
         content=content[0],
-        series_instance_uid=series_uid(finding, "report", str(first.StudyInstanceUID), place),
+        series_instance_uid=series_uid(finding, "report", first, subject, str(number)),
         series_number=SERIES_NUMBERS["report"],
         sop_instance_uid=output_uid(finding, f"{subject}-{number}-report"),
         # measurements, approaches and punctures are numbered each by themselves

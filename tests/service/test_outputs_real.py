@@ -22,8 +22,9 @@ from service.dicom_out.finding import Distance, Finding
 from service.dicom_out.make import Output, dataset_of
 
 CENTRE_PX = (40.25, 51.5)
-# a code for the de-identification, a patient's age that is none: they are handed on as they are
-SOURCES_OWN_FAULTS = ("(0012,0064)", "(0010,1010)")
+# a code for the de-identification, a patient's age that is none, a body part that is none of the
+# standard's: they are handed on as they are
+SOURCES_OWN_FAULTS = ("(0012,0064)", "(0010,1010)", "(0018,0015)")
 
 # pydicom's, about values that scanners have written
 pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")

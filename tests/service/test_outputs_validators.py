@@ -1,0 +1,148 @@
+"""All objects of a case with five punctures, by the programs that archives and stations use."""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pydicom
+import pytest
+from highdicom.sr import Comprehensive3DSR
+from receivers import free_port, needs_program
+from recorded_case import come_to_ready, make_case, puncture
+
+from case_record.record import CaseRecord
+from service.dicom_out.make import Output, make_output, outputs_to_send
+
+# What the validators say of every case, and why it is so. docs/dicom_outputs.md has the same table.
+EXPLAINED = {
+    "Unrecognized defined term <99AUTOSPINE>": "private codes are designated so, by the standard",
+    "Different information entities for attribute - Element=<AccessionNumber>": "the tool counts "
+    "it to the series of images and to the study of reports; its values are equal",
+    "Unrecognized defined term <M> for value 3 of attribute <Image Type>": "the scanner's own word",
+    "Standard Extended SOP Class": "follows from the next one",
+    "(0x0018,0x9073) FD Acquisition Duration": "the scanner's own, in a classic image",
+}
+
+
+@pytest.fixture(scope="module")
+def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
+    case_dir = make_case(tmp_path_factory.mktemp("five"))
+    with CaseRecord(case_dir) as record:
+        for _ in range(5):
+            puncture(record, come_to_ready(record))
+        made = [make_output(record, output) for output in outputs_to_send(record)]
+        made.append(make_output(record, Output("measurement", 1, "report")))
+        made.append(make_output(record, Output("measurement", 1, "presentation")))
+    return [*sorted((case_dir / "inbox").iterdir()), *made]
+
+
+def unexplained(said: str) -> list[str]:
+    lines = [line for line in said.splitlines() if line.startswith(("Error", "Warning"))]
+    return [line for line in lines if not any(known in line for known in EXPLAINED)]
+
+
+@needs_program("dcentvfy")
+def test_attributes_of_patient_study_series_and_frame_are_the_same_in_all_objects(objects):
+    done = subprocess.run(["dcentvfy", *objects], capture_output=True, text=True)
+    assert unexplained(done.stdout + done.stderr) == []
+
+
+@needs_program("dciodvfy")
+def test_every_object_has_what_its_modules_ask_for(objects):
+    for path in objects:
+        done = subprocess.run(["dciodvfy", path], capture_output=True, text=True)
+        assert unexplained(done.stdout + done.stderr) == [], path.name
+
+
+@needs_program("dcmpschk")
+def test_dcmtk_and_highdicom_read_every_object(objects):
+    for path in objects:
+        done = subprocess.run(["dcmdump", path], capture_output=True, text=True)
+        assert (done.returncode, done.stderr) == (0, ""), path.name
+        dataset = pydicom.dcmread(path)
+        if dataset.Modality == "SR":
+            groups = Comprehensive3DSR.from_dataset(dataset).content.get_image_measurement_groups()
+            assert len(groups) == 1
+        if dataset.Modality == "PR":
+            done = subprocess.run(["dcmpschk", path], capture_output=True, text=True)
+            assert (done.returncode, re.findall("error", done.stderr)) == (0, []), done.stderr
+
+
+def test_every_report_is_a_series_of_its_own_and_names_itself(objects):
+    reports = [d for d in map(pydicom.dcmread, objects) if d.Modality == "SR"]
+    assert len({d.SeriesInstanceUID for d in reports}) == len(reports) == 11
+    assert len({d.SeriesNumber for d in reports}) == len(reports)
+    assert len({d.SeriesDescription for d in reports}) == len(reports)
+
+
+def test_a_derived_image_keeps_what_its_sources_say_and_reads_the_same_without_a_rescale(objects):
+    read = [pydicom.dcmread(path) for path in objects]
+    source = next(d for d in read if d.Modality == "MR" and d.ImageType[0] == "ORIGINAL")
+    for derived in (d for d in read if d.Modality == "MR" and d.ImageType[0] == "DERIVED"):
+        for keyword in ("BodyPartExamined", "SpacingBetweenSlices", "PatientWeight"):
+            assert derived[keyword].value == source[keyword].value
+        assert "RescaleSlope" not in derived
+        # the same grey values as the source's, to the noise: the sky is as dark, oil as bright
+        low, high = np.percentile(derived.pixel_array, [50, 99])
+        stored = source.pixel_array * float(source.get("RescaleSlope", 1)) + float(
+            source.get("RescaleIntercept", 0)
+        )
+        assert [low, high] == pytest.approx(np.percentile(stored, [50, 99]), rel=0.2, abs=15)
+
+
+@contextmanager
+def running_orthanc(folder: Path) -> Iterator[str]:
+    port, dicom_port = free_port(), free_port()
+    (folder / "orthanc.json").write_text(
+        json.dumps(
+            {
+                "StorageDirectory": str(folder / "store"),
+                "IndexDirectory": str(folder / "store"),
+                "HttpPort": port,
+                "DicomPort": dicom_port,
+                "RemoteAccessAllowed": False,
+                "AuthenticationEnabled": False,
+            }
+        )
+    )
+    with (folder / "orthanc.log").open("wb") as log:
+        process = subprocess.Popen(
+            ["Orthanc", str(folder / "orthanc.json")], stdout=log, stderr=subprocess.STDOUT
+        )
+    url = f"http://127.0.0.1:{port}"
+    try:
+        deadline_s = time.monotonic() + 120
+        while True:
+            try:
+                httpx.get(f"{url}/system").raise_for_status()
+                break
+            except httpx.HTTPError:
+                assert process.poll() is None, (folder / "orthanc.log").read_text()
+                assert time.monotonic() < deadline_s
+                time.sleep(0.1)
+        yield url
+    finally:
+        process.terminate()
+        process.wait(60)
+
+
+@pytest.mark.skipif(shutil.which("Orthanc") is None, reason="needs Orthanc")
+def test_an_archive_shows_each_report_under_its_own_description(objects, tmp_path):
+    with running_orthanc(tmp_path) as url:
+        for path in objects:
+            httpx.post(f"{url}/instances", content=path.read_bytes()).raise_for_status()
+        series = httpx.get(f"{url}/series?expand").json()
+    tags = [one["MainDicomTags"] for one in series if one["MainDicomTags"]["Modality"] == "SR"]
+    shown = sorted(tag["SeriesDescription"] for tag in tags)
+    assert len(set(shown)) == len(shown) == 11
+    subject = re.compile(r"AutoSPINe (measurement|approach|puncture) \d+ ")
+    assert all(subject.match(one) for one in shown), shown
