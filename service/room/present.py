@@ -221,13 +221,20 @@ def _robot_changed(facts: Mapping[str, Any], now: Now) -> Lost | None:
     )
 
 
+# what moves a robot besides commands, as the bridge names it in `last_motion`
+_MOTIONS = {
+    "declared": Lost("declared", "measured before the robot's position was declared"),
+    "park": Lost("parked", "measured before the drives were parked"),
+    "parked": Lost("parked", "measured before the drives were parked"),
+}
+
+
 def _moved(facts: Mapping[str, Any], status: BridgeStatus) -> Lost | None:
     if facts["boot_id"] != status.boot_id:
         return Lost("bridge_restarted", "measured before the robot's bridge was restarted")
     if status.last_motion != facts["last_motion"]:
-        if status.last_motion.startswith("declared:"):
-            return Lost("declared", "measured before the robot's position was declared")
-        return Lost("moved", "measured before the last move")
+        what = status.last_motion.partition(":")[0]
+        return _MOTIONS.get(what, Lost("moved", "measured before the last move"))
     return Lost("moving", "the robot moves") if status.moving else None
 
 
