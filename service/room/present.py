@@ -224,8 +224,9 @@ def _robot_changed(facts: Mapping[str, Any], now: Now) -> Lost | None:
 # what moves a robot besides commands, as the bridge names it in `last_motion`
 _MOTIONS = {
     "declared": Lost("declared", "measured before the robot's position was declared"),
-    "park": Lost("parked", "measured before the drives were parked"),
     "parked": Lost("parked", "measured before the drives were parked"),
+    "lost": Lost("position", "the robot's position became uncertain since"),
+    "stray": Lost("stray", "an axis has moved without a command since"),
 }
 
 
