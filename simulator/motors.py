@@ -10,6 +10,7 @@ the loopback) takes one request a line and answers one JSON line:
     motions                  every motion begun: axis, cause, start, end, from, to
     fault AXIS NAME on|off   a fault of one controller or motor (see AxisFaults)
     line NAME NUMBER         a fault of the serial line (see LineFaults)
+    switch NAME VALUE        an open question of the manual (see Switches)
     power-cycle              the controllers lose their supply
     slip AXIS MM             something pushes the stage
     load AXIS FRACTION       load in units of the stall load
@@ -26,15 +27,21 @@ import signal
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 
 from robot_bridge.emulator.axis import EmulatedController, Motor
 from robot_bridge.emulator.bus import EmulatedBus
+from robot_bridge.emulator.control import (
+    RequestError,
+    set_fault,
+    set_line_fault,
+    set_switch,
+)
+from robot_bridge.emulator.line_server import LineServer
 from robot_bridge.emulator.server import EmulatorServer, PseudoTerminal
-from robot_bridge.emulator.switches import AxisFaults, LineFaults, Switches
-from simulator.line_server import LineServer
+from robot_bridge.emulator.switches import Switches
 from simulator.motion_truth import COMMANDED, MotionTruth
 from simulator.stage_physics import PiezoLegsStage, StageParameters
 
@@ -44,10 +51,6 @@ PARENT_CHECK_S = 0.25
 
 class StateFileError(ValueError):
     """The file of true positions does not hold them."""
-
-
-class RequestError(ValueError):
-    """A request on the truth port that cannot be answered."""
 
 
 def read_state(path: Path, axes: Sequence[str]) -> dict[str, float]:
@@ -122,7 +125,7 @@ class VirtualMotors:
         controller = EmulatedController(
             address,
             stage,
-            replace(motor, serial_number=motor.serial_number + address),
+            _mounted(motor, parameters.mounting, address),
             switches,
             time.monotonic(),
             on_motion=lambda cause: self.truth.begin(name, cause, time.time()),
@@ -151,6 +154,7 @@ class VirtualMotors:
             "motions": self._motions,
             "fault": self._fault,
             "line": self._line_fault,
+            "switch": self._switch,
             "power-cycle": self._power_cycle,
             "slip": self._slip,
             "load": self._load,
@@ -191,17 +195,15 @@ class VirtualMotors:
         return self.axes[name]
 
     def _fault(self, axis: str, name: str, on_off: str) -> dict[str, object]:
-        if name not in {f.name for f in fields(AxisFaults)} or on_off not in ("on", "off"):
-            raise RequestError(f"fault {name} {on_off}: not a fault that can be set so")
-        setattr(self._named_axis(axis).controller.faults, name, on_off == "on")
+        set_fault(self._named_axis(axis).controller, name, on_off)
         return {"ok": True}
 
     def _line_fault(self, name: str, number: str) -> dict[str, object]:
-        known = {f.name: f.type for f in fields(LineFaults) if f.name != "chatter"}
-        if name not in known:
-            raise RequestError(f"line {name}: not one of {', '.join(known)}")
-        value = float(number) if known[name] is float else int(number)
-        setattr(self.bus.faults, name, value)
+        set_line_fault(self.bus, name, number)
+        return {"ok": True}
+
+    def _switch(self, name: str, text: str) -> dict[str, object]:
+        set_switch(self.bus, name, text)
         return {"ok": True}
 
     def _power_cycle(self) -> dict[str, object]:
@@ -216,6 +218,19 @@ class VirtualMotors:
     def _load(self, axis: str, load: str) -> dict[str, object]:
         self._named_axis(axis).stage.apply_load(float(load))
         return {"ok": True}
+
+
+def _mounted(motor: Motor, mounting: int, address: int) -> Motor:
+    """Its own serial number, and the limit switches as its forward direction meets them."""
+    switches_um = motor.switches_um
+    if switches_um is not None and mounting < 0:
+        switches_um = (-switches_um[1], -switches_um[0])
+    return replace(
+        motor,
+        serial_number=motor.serial_number + address,
+        switches_um=switches_um,
+        mounting=mounting,
+    )
 
 
 class MotorsProcess:
@@ -265,6 +280,9 @@ def _parser() -> argparse.ArgumentParser:
         "--reversed", default="", help="axes whose motor is mounted the other way round"
     )
     parser.add_argument("--encoder-um-per-count", type=float, help="fit encoders")
+    parser.add_argument(
+        "--switches-mm", help="LOW,HIGH: true positions at which limit switches are pressed"
+    )
     parser.add_argument("--step-um", type=float, default=StageParameters.step_um)
     parser.add_argument("--asymmetry", type=float, default=StageParameters.asymmetry)
     parser.add_argument("--scatter", type=float, default=StageParameters.scatter)
@@ -297,6 +315,9 @@ def _motors_from(args: argparse.Namespace) -> VirtualMotors:
     each = {axis: replace(parameters, mounting=-1 if axis in reversed_axes else 1) for axis in axes}
     firmware = "V13" if args.model == "PMD401" else "V20"
     motor = Motor(args.model, firmware=firmware, um_per_count=encoder_um or 0.1)
+    if args.switches_mm:
+        low_mm, high_mm = map(float, args.switches_mm.split(","))
+        motor = replace(motor, switches_um=(low_mm * 1000, high_mm * 1000))
     positions_mm = read_state(args.state, axes)
     return VirtualMotors(axes, positions_mm, each, motor, args.seed, args.speed_factor, args.state)
 

@@ -2,6 +2,6 @@
 
 import sys
 
-from robot_bridge.emulator.server import main
+from robot_bridge.emulator.main import main
 
 sys.exit(main())

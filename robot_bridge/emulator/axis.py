@@ -22,6 +22,9 @@ MAX_SPEED_HZ = {"PMD401": 1500, "PMD301": 2500}
 # Capacitance x frequency that the output stage can drive, from the examples in the manuals.
 DERATING_NF_HZ = {"PMD401": 944_000, "PMD301": 3_501_000}
 SCRIPT_STEPS = 16
+OUTPUTS_HIGH = {"PMD401": 0b111, "PMD301": 0b011}  # they are inputs, pulled up, until they are set
+INDEXED = 1  # the position was reset at the index
+INDEX_SEARCHES = (STOP_AT_INDEX, RESET_AT_INDEX) = (2, 4)
 
 
 @dataclass(frozen=True)
@@ -87,10 +90,11 @@ class EmulatedController:
         self.target_limit = False
         self.external_limit_at_ms: int | None = None
         self.index_mode, self.index_position, self.index_unreported = 0, 0, False
+        self.index_found = False
         self.default_speed_hz = 1000
         self.last_target = 0
         self.stored: str | None = None
-        self.outputs = 0
+        self.outputs = OUTPUTS_HIGH[self.motor.model]
         self.script_outcome = 0
         self.log: PositionLog | None = None
         self.log_armed_s: float | None = None
@@ -130,6 +134,10 @@ class EmulatedController:
     @property
     def can_run(self) -> bool:
         return not (self.parked or self._power_change or self.powerless)
+
+    @property
+    def unparking(self) -> bool:
+        return bool(self._power_change and not self._power_change[1] and not self.powerless)
 
     @property
     def powerless(self) -> bool:
@@ -188,6 +196,10 @@ class EmulatedController:
 
     @property
     def moving(self) -> bool:
+        return self._run_turns and not (self.parked and not self.unparking)
+
+    @property
+    def _run_turns(self) -> bool:
         return isinstance(self.run, OpenRun) or (
             isinstance(self.run, TargetRun) and not self.run.idle
         )
@@ -304,26 +316,31 @@ class EmulatedController:
 
     def _follow_encoder(self) -> None:
         raw = self._encoder_raw()
-        change, self._raw_count = raw - self._raw_count, raw
+        raw_before, self._raw_count = self._raw_count, raw
+        change = raw - raw_before
         if self.settings[y.ENCODER_TYPE] == y.HOST_ENCODER or self.faults.encoder_frozen:
             return
         if self.settings[y.ENCODER_DIRECTION]:
             change = -change
-        before, self.count = self.count, self.count + change
-        self._look_for_index(raw - change, raw, before)
+        self.count += change
+        self._look_for_index(raw_before, raw)
 
-    def _look_for_index(self, raw_before: int, raw: int, count_before: int) -> None:
-        if self.motor.index_um is None or self.index_mode not in (2, 4) or raw == raw_before:
+    def _look_for_index(self, raw_before: int, raw: int) -> None:
+        searching = self.index_mode in INDEX_SEARCHES and not self.index_found
+        if self.motor.index_um is None or not searching or raw == raw_before:
             return
-        mark = round(self.motor.index_um / self.motor.um_per_count)
+        sign = -1 if self.motor.encoder_reversed else 1
+        mark = sign * round(self.motor.index_um / self.motor.um_per_count)
         if not min(raw_before, raw) <= mark <= max(raw_before, raw):
             return
         self.latched |= Status.INDEX
-        self.index_position, self.index_unreported = self.count, True
+        beyond = mark - raw if self.settings[y.ENCODER_DIRECTION] else raw - mark
+        self.index_position, self.index_unreported = self.count - beyond, True
         self.run = None
-        if self.index_mode == 4:
-            self.count = self.settings[y.INDEX_OFFSET]
-        self.index_mode = 1
+        self.index_found = True
+        if self.index_mode == RESET_AT_INDEX:
+            self.count = self.settings[y.INDEX_OFFSET] + beyond
+            self.index_mode = INDEXED
 
     # Status
 

@@ -50,7 +50,7 @@ def status_error(controller: EmulatedController) -> None:
 
 def _run(controller: EmulatedController, body: str) -> str | None:
     if body.endswith("b") and len(body) > 1:
-        controller.stored = body[:-1]
+        controller.stored = body
         return None
     letter, rest = body[0], body[1:]
     if letter == "S":  # whatever follows, a stop is a stop
@@ -61,8 +61,9 @@ def _run(controller: EmulatedController, body: str) -> str | None:
     handler = _HANDLERS.get(letter)
     if handler is None:
         raise NotUnderstoodError
-    described = rest.endswith("?") and letter == "N"
-    return handler(controller, _integers(rest[:-1] if described else rest))
+    if letter == "N" and rest == "?":
+        return motions.index_described(controller)
+    return handler(controller, _integers(rest))
 
 
 def _integers(text: str) -> list[int]:
@@ -80,7 +81,7 @@ def _stored(c: EmulatedController, args: list[int]) -> str | None:
     if args[0] == 0:
         c.stored = None
     elif args[0] == 1 and c.stored:
-        if failed(execute(c, c.stored)):
+        if failed(execute(c, c.stored.removesuffix("b"))):
             raise NotPossibleError
     else:
         raise NotPossibleError

@@ -7,7 +7,7 @@ echo.
 from collections.abc import Callable
 
 from robot_bridge.emulator import settings as y
-from robot_bridge.emulator.axis import EmulatedController
+from robot_bridge.emulator.axis import INDEX_SEARCHES, INDEXED, EmulatedController
 from robot_bridge.emulator.refusals import (
     NotPossibleError,
     NotUnderstoodError,
@@ -68,7 +68,7 @@ def default_speed(c: EmulatedController, args: list[int]) -> str | None:
 def run_to_index(c: EmulatedController, args: list[int]) -> str | None:
     if not args:
         return _run_answer(c)
-    if c.index_mode not in (2, 4):
+    if c.index_mode not in INDEX_SEARCHES or c.index_found:
         raise NotPossibleError
     run = _open_run_from(c, args)
     run.until_index = True
@@ -109,18 +109,24 @@ def encoder(c: EmulatedController, args: list[int]) -> str | None:
     if not args:
         return str(c.count)
     c.count = args[0]
-    if args[0] == 0:
-        c.settings.store(y.INDEX_OFFSET, 0)
-        c.index_mode = 0
+    c.settings.store(y.INDEX_OFFSET, 0)
+    c.index_mode = 0
     return None
 
 
 def index(c: EmulatedController, args: list[int]) -> str | None:
     if args:
-        if args[0] not in (0, 2, 4):
+        if args[0] not in (0, *INDEX_SEARCHES):
             raise NotPossibleError
-        c.index_mode = args[0]
+        c.index_mode, c.index_found = args[0], False
         return None
     dot = "." if c.index_unreported else ""
     c.index_unreported = False
     return f"{c.index_mode},{c.index_position}{dot}"
+
+
+_INDEX_MODES = {0: "off", INDEXED: "indexed", 2: "stopI", 4: "resetI"}
+
+
+def index_described(c: EmulatedController) -> str:
+    return f"{index(c, [])}, {_INDEX_MODES[c.index_mode]}"

@@ -4,7 +4,7 @@ import re
 from collections.abc import Callable
 
 from robot_bridge.emulator import settings as y
-from robot_bridge.emulator.axis import REBOOT_S, SCRIPT_STEPS, EmulatedController
+from robot_bridge.emulator.axis import INDEXED, REBOOT_S, SCRIPT_STEPS, EmulatedController
 from robot_bridge.emulator.refusals import (
     NotImplementedHereError,
     NotPossibleError,
@@ -23,7 +23,10 @@ def parameter(c: EmulatedController, rest: str) -> str | None:
         raise NotUnderstoodError
     number, value = int(matched[1]), matched[2]
     if value is None:
-        return _read_parameter(c, number)
+        told = _read_parameter(c, number)
+        if matched[3] and number in y.SETTINGS and "," not in told:
+            told += f", {y.SETTINGS[number].name}"
+        return told
     _set_parameter(c, number, int(value))
     return None
 
@@ -43,11 +46,15 @@ def _set_parameter(c: EmulatedController, number: int, value: int) -> None:
     if number in y.SETTINGS:
         if not c.settings.accepts(number, value):
             raise NotPossibleError
+        if number == y.INDEX_OFFSET and c.index_mode == INDEXED:
+            c.count += value - c.settings[number]  # the position of the index is another one now
         c.settings.store(number, value)
     elif number == 25 and value == 1:
         _start_script(c)
+    elif number == 25 and value == 0:
+        _stop_script(c)
     elif number == 1 and value == 2:
-        c.settings.power_on()
+        c.settings.reload()
     elif number == 1 and value == 3:
         c.settings.factory()
     else:
@@ -58,6 +65,11 @@ def _start_script(c: EmulatedController) -> None:
     require_power(c)
     run = OpenRun(SCRIPT_STEPS * MICROSTEPS_PER_STEP, 1, 100.0, script=True)
     c.begin_open_run(run, "script")
+
+
+def _stop_script(c: EmulatedController) -> None:
+    if isinstance(c.run, OpenRun) and c.run.script:
+        c.stop()
 
 
 def _script_state(c: EmulatedController) -> str:

@@ -16,8 +16,11 @@ class NotImplementedHereError(Exception):
 
 
 def require_power(c: EmulatedController) -> None:
-    """A run while parked is answered by `!`, and unparks instead of moving."""
-    if c.can_run:
+    """A run while parked is answered by `!`, and unparks instead of moving.
+
+    While it unparks already it waits for that, as drivers written on hardware count on.
+    """
+    if c.can_run or (c.unparking and c.switches.while_unparking == "wait"):
         return
     if not c.powerless:
         c.unpark()

@@ -1,26 +1,21 @@
 """Emulated controllers behind a real pseudo-terminal or TCP port, as a thread-free server.
 
 One process-local loop: `EmulatorServer.serve_once` waits at most a few milliseconds, feeds the
-bus and sends what is due. `python -m robot_bridge.emulator` serves ideal stages on their own.
+bus and sends what is due. The command that runs it is in emulator.main.
 """
 
-import argparse
 import contextlib
-import json
 import os
-import random
 import select
 import socket
 import time
 import tty
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Protocol
 
-from robot_bridge.emulator.axis import EmulatedController, Motor
 from robot_bridge.emulator.bus import EmulatedBus
-from robot_bridge.emulator.physics import IdealStage
-from robot_bridge.emulator.switches import Switches
+from robot_bridge.emulator.line_server import LineServer
 
 MOVING_WAIT_S = 0.004
 IDLE_WAIT_S = 0.25
@@ -174,27 +169,14 @@ class EmulatorServer:
         self.wire.close()
 
 
-def ideal_bus(addresses: Sequence[int], switches: Switches, speed_factor: float) -> EmulatedBus:
-    controllers = [
-        EmulatedController(address, IdealStage(), Motor(), switches, time.monotonic(), speed_factor)
-        for address in addresses
-    ]
-    return EmulatedBus(controllers, switches, random.Random(0))
-
-
-def main(argv: Sequence[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(prog="python -m robot_bridge.emulator", description=__doc__)
-    parser.add_argument("--addresses", default="1,2", help="comma-separated, default 1,2")
-    parser.add_argument("--pty-path", type=Path, help="make a link to the pseudo-terminal here")
-    parser.add_argument("--tcp-port", type=int, help="serve on 127.0.0.1 instead (0: any)")
-    parser.add_argument("--speed-factor", type=float, default=1.0)
-    args = parser.parse_args(argv)
-    addresses = [int(a) for a in args.addresses.split(",")]
-    wire: Wire = PseudoTerminal(args.pty_path) if args.tcp_port is None else TcpPort(args.tcp_port)
-    server = EmulatorServer(ideal_bus(addresses, Switches(), args.speed_factor), wire)
-    print(json.dumps({"ready": True, "url": wire.url}), flush=True)
-    with contextlib.suppress(KeyboardInterrupt):
-        while True:
-            server.serve_once()
-    server.close()
-    return 0
+def serve_until(
+    running: Callable[[], bool], server: EmulatorServer, others: Sequence[LineServer] = ()
+) -> None:
+    """One loop over the serial line and the control ports."""
+    while running():
+        control = [d for other in others for d in other.descriptors()]
+        watched = [*server.wire.descriptors(), *control]
+        ready, _, _ = select.select(watched, [], [], server.wait_s(time.monotonic()))
+        server.serve(ready)
+        for other in others:
+            other.serve(ready)

@@ -49,6 +49,10 @@ SETTINGS = {
 }
 
 
+COMPARED = (*range(LIMIT_A, SPEED_MODEL + 1), 38, 39)
+RELOADED = (*COMPARED, ADDRESS)
+
+
 class EmulatedSettings:
     """Memory and flash of one controller. Keys are the parameter numbers."""
 
@@ -76,6 +80,10 @@ class EmulatedSettings:
         if self.memory[ENCODER_TYPE] > LAST_FLASH_ENCODER_TYPE:
             self.memory[ENCODER_TYPE] = HOST_ENCODER
 
+    def reload(self) -> None:
+        """`Y1,2`: less than a power-on brings back; Y2, Y13, Y14 and Y44 stay as they are."""
+        self.memory |= {n: v for n, v in self.flash.items() if n in RELOADED}
+
     def save(self) -> None:
         self.flash = {n: v for n, v in self.memory.items() if SETTINGS[n].in_flash}
 
@@ -86,4 +94,4 @@ class EmulatedSettings:
         """0 equal, 1 differs, 2 the axis address differs."""
         if self.memory[ADDRESS] != self.flash[ADDRESS]:
             return 2
-        return int(any(self.memory[n] != v for n, v in self.flash.items()))
+        return int(any(self.memory[n] != self.flash[n] for n in COMPARED))

@@ -20,6 +20,7 @@ class Switches:
     hex_case: Literal["lower", "upper"] = "lower"
     own_echo: bool = False  # the adapter loops the host's bytes back
     m6_parks: bool = True
+    while_unparking: Literal["wait", "refuse"] = "wait"  # a run that comes in those 80 ms
     overspeed: Literal["clamp", "refuse"] = "clamp"
     target_beyond_limit: Literal["stop_there", "refuse"] = "stop_there"
     broadcast_stop: bool = True

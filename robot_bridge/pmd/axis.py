@@ -132,6 +132,8 @@ class PmdAxis(PmdController):
         distance_um = setpoint_um - self.position_um
         if self.proven or not self.closed_loop or abs(distance_um) < PROOF_FROM_UM:
             return
+        if (yield from self._microstep_phase()) is None:
+            return  # nothing would tell how far the motor went, so the encoder cannot be blamed
         from_um = self.position_um
         run_um = PROOF_UM if distance_um > 0 else -PROOF_UM
         yield from self.run_open_loop(pmd_units.microsteps_from_um(self.config, run_um))

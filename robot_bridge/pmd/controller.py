@@ -216,7 +216,10 @@ class PmdController:
             return
         self._supply_due_s = self._clock() + SUPPLY_PERIOD_S
         reply = yield from self.ask_if_it_can("U2", "supply and temperature are not known")
-        self.supply = parse_supply(reply.value) if reply else None
+        try:
+            self.supply = parse_supply(reply.value) if reply else None
+        except PmdError:
+            self.doubts["U2"] = "supply and temperature are not understood"
 
     @property
     def _drift_um(self) -> float:

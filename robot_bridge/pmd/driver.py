@@ -88,8 +88,8 @@ class PmdMotors:
     def open(self) -> MotorStatus:
         log.warning(UNTRIED)
         self._ports.connect()
-        deadline_s = self._clock() + INITIALISE_DEADLINE_S
         for axis in self._axes.values():
+            deadline_s = self._clock() + INITIALISE_DEADLINE_S
             self._run(axis, axis.set_up(), "initialisation", deadline_s)
             log.info("axis %s: %s", axis.config.name, axis.identity)
         self._initialised = True

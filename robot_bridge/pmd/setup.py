@@ -200,17 +200,18 @@ def _set(c: PmdController, wanted: dict[int, int]) -> Steps[None]:
     """
     c.settings = {}
     have = yield from _read_some(c, wanted)
-    if not have:
-        c.doubts["settings"] = "settings cannot be read back; nothing tells that they hold"
-    try:
-        for number, value in wanted.items():
-            if have.get(number) != value:
-                yield pmd_protocol.set_parameter(c.address, number, value)
-    except PmdNoValueError:
-        if have:
-            raise
-    if not have:
-        return
+    if unread := [f"Y{number}" for number in wanted if number not in have]:
+        c.doubts[", ".join(unread)] = "nothing tells that these settings hold"
+    for number, value in wanted.items():
+        if have.get(number) == value:
+            continue
+        try:
+            yield pmd_protocol.set_parameter(c.address, number, value)
+        except PmdNoValueError:
+            if not unread:
+                raise
+    if unread:
+        return  # a board that tells some settings and not others is no witness for any
     got = yield from _read_some(c, wanted)
     for number, value in wanted.items():
         if got.get(number) != value:
@@ -243,7 +244,7 @@ def _read_all(c: PmdController) -> Steps[dict[int, int] | None]:
 
 
 def _read_some(c: PmdController, numbers: dict[int, int]) -> Steps[dict[int, int]]:
-    """The settings by number; empty if the board tells none."""
+    """The settings by number, as many as the board tells."""
     together = yield from _read_all(c)
     if together is not None:
         return together
@@ -252,7 +253,5 @@ def _read_some(c: PmdController, numbers: dict[int, int]) -> Steps[dict[int, int
         try:
             got[number] = (yield from c.ask(f"Y{number}")).integer()
         except PmdNoValueError:
-            if not got:
-                return {}
-            raise
+            continue
     return got

@@ -23,6 +23,7 @@ SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "service": ("service.cli.processes:service", "Page, API, procedure, planner."),
     "bridge": ("robot_bridge.__main__:main", "The daemon in the scanner room."),
     "robot": ("robot_bridge.engineer.main:main", "Engineer's commands for bridge and motors."),
+    "emulator": ("robot_bridge.emulator.main:main", "Emulated motor controllers alone."),
     "scanner": ("simulator.command_line:scanner", "The virtual scanner alone."),
     "locate": ("service.cli.locate:app", "Find the round objects in DICOM files."),
     "reconstruct": (

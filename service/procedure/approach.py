@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from service.procedure.calibration import Calibration
 from service.procedure.estimate import FiducialEstimate, axis_sigma, probability_within
+from service.procedure.plan import PlanPart
 from service.procedure.steering import Standing, SteeringArguments, frames_that_decide, steer
 from service.procedure.steps import ProcedureSteps
 from service.procedure.strategies import (
@@ -101,10 +102,13 @@ class SteeredFiducial:
         error = self.error_mm(estimate)
         if np.linalg.norm(error) > _WORTH_MORE_FRAMES * self.arguments.tolerance_mm:
             return present
-        return frames_that_decide(present, estimate, self.is_sure)
+        return frames_that_decide(present, estimate, self.is_sure, self.arguments.most_frames)
 
     def error_mm(self, estimate: FiducialEstimate) -> NDArray[np.float64]:
         return np.array(self.arguments.target_mm) - estimate.plane_mm
+
+    def parts(self, estimate: FiducialEstimate) -> tuple[PlanPart, ...]:
+        return ()  # the displacement says it all
 
     def probability(self, estimate: FiducialEstimate) -> float:
         """That the fiducial is within the tolerance."""

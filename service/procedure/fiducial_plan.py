@@ -75,6 +75,7 @@ def approach_of(
         strategy=service.strategy,
         seed=seed,
         proven=proven,
+        most_frames=service.most_slices,
     )
 
 

@@ -100,4 +100,5 @@ def guide_approach_of(
         confirm_moves=service.confirm_moves,
         gate=gate_of(config),
         proven=proven,
+        most_frames=service.most_slices,
     )

@@ -284,6 +284,8 @@ def test_the_position_log():
 
 def test_digital_outputs():
     bench = Bench((1,))
+    assert bench.say(b"X1D\r") == b"X1D:111,1100\r"  # they are inputs, pulled up
+    bench.say(b"X1D0,0\rX1D1,0\rX1D2,0\r")
     assert bench.say(b"X1D\r") == b"X1D:000,1100\r"
     assert bench.say(b"X1D1,1\r") == b"X1D1,1\r"
     assert bench.say(b"X1D\r") == b"X1D:010,1100\r"

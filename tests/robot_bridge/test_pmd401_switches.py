@@ -20,6 +20,7 @@ SINGLE = [
     Switches(own_echo=True),
     Switches(m6_parks=False),
     Switches(overspeed="refuse"),
+    Switches(while_unparking="refuse"),
     Switches(target_beyond_limit="refuse"),
     Switches(broadcast_stop=False),
     Switches(encoder_type_description=False),

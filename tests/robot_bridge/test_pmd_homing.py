@@ -53,9 +53,9 @@ def test_the_index_of_an_encoder_is_found_and_left_behind_in_the_count():
         motors.home(["xt"])
         status = finish(motors)
         assert status.fault is None, status
-        motors.move_to({"xt": 500})
+        motors.move_to({"xt": -1000})
         assert finish(motors).reached
-        assert made.position_um(1) == pytest.approx(3000, abs=2)
+        assert made.position_um(1) == pytest.approx(1500, abs=2)
 
 
 def refused(motors, why: str) -> None:

@@ -94,7 +94,7 @@ class TargetCommands:
             return self._room.begin(GUIDE_RECORDING, {**told, "label": label, "by": by}, by)
         start = self._room.start_point()
         proof = self._room.proof_arguments(start)
-        arguments = recording_of(self._room.config, self._room.seed(), proof)
+        arguments = recording_of(self._room.settings(), self._room.seed(), proof)
         body = {**recording_arguments(arguments, start), "label": label, "by": by}
         return self._room.begin(RECORDING, body, by)
 
