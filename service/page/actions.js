@@ -13,28 +13,25 @@ const READ_FIRST_MS = 700;
 
 const post = (path, body) => () => order("POST", `api/v1/${path}`, body);
 
-// Which actions make sense now. The first one that is possible is the large button.
+// Which actions make sense now. Green is only what the prompt asks for.
 export function actionsFor(state) {
   const { robot } = state;
   const idle = !state.procedure;
   const free = idle && robot.linked && !robot.stopped && robot.armed && !state.ready && !robot.insertion_locked;
   const list = [];
-  const add = (label, run, possible, extra = {}) => { if (possible) list.push({ label, run, ...extra }); };
-  add(robot.stopped ? words.rearm : words.arm, post("reset"),
+  const add = (code, label, run, possible) => { if (possible) list.push({ code, label, run }); };
+  add("reset", robot.stopped ? words.rearm : words.arm, post("reset"),
     robot.linked && !robot.moving && (robot.stopped || !robot.armed || !robot.position_certain));
-  if (state.ready) {
-    add(words.puncture, "puncture", robot.insertion_locked && !state.punctured);
-    add(words.needleOut, post("needle-out"), true, { last: !state.punctured });
-  } else {
-    add(words.needleOut, post("needle-out"), robot.linked && robot.insertion_locked);
-  }
-  add(words.approach, post("approach"), free && state.calibrated && state.target_patient_mm && (!state.guide || state.entry_patient_mm));
-  add(words.calibrate, post("calibration"), free);
-  add(words.targetHere, post("target/here"), free && state.calibrated && !state.guide);
+  add("puncture", words.puncture, "puncture", state.ready && robot.insertion_locked && !state.punctured);
+  add("approach", words.approach, post("approach"), free && state.calibrated && state.target_patient_mm && (!state.guide || state.entry_patient_mm));
+  add("calibration", words.calibrate, "calibration", free);
+  add("target", words.targetHere, post("target/here"), free && state.calibrated && !state.guide);
   const wanted = state.acquisition_request;
-  add(words.acquired(wanted?.hold_id), post("acquisition", { hold_id: wanted?.hold_id }), state.arrival_mode && wanted);
-  add(words.abort, post("abort"), !idle);
-  return list.sort((a, b) => (a.last ? 1 : 0) - (b.last ? 1 : 0));
+  add("acquisition", words.acquired(wanted?.hold_id), post("acquisition", { hold_id: wanted?.hold_id }), state.arrival_mode && wanted);
+  add("abort", words.abort, post("abort"), !idle);
+  // last and apart, never where another button has been: it takes two steps besides
+  add("needle-out", words.needleOut, "needle-out", robot.linked && (state.ready || robot.insertion_locked));
+  return list;
 }
 
 const drawChips = whenChanged((robot) => {
@@ -66,13 +63,14 @@ export class Next {
     setText(byId("said"), state.punctured ? words.punctured : "");
     forgetOldRefusal(state);
     this.drawQuestion(state.question, state);
-    this.drawActions([role, actionsFor(state).map((action) => action.label), state.question?.question_id], state);
+    this.drawActions([role, actionsFor(state).map((action) => action.label), state.question?.question_id, state.next_action], state);
   }
 
   actions(state) {
     const list = state.question ? actionsFor(state).filter((a) => a.label === words.abort) : actionsFor(state);
-    replace(byId("actions"), list.map((action, place) => h("button", {
-      type: "button", class: place === 0 && !state.procedure ? "main" : null, disabled: !this.mayAct,
+    replace(byId("actions"), list.map((action) => h("button", {
+      type: "button", disabled: !this.mayAct,
+      class: [action.code === state.next_action ? "main" : "", action.code === "needle-out" ? "apart" : ""].join(" ").trim() || null,
       title: this.mayAct ? null : words.viewersOnly,
       onclick: () => this.run(action.run),
     }, action.label)));
@@ -80,7 +78,20 @@ export class Next {
 
   run(what) {
     if (what === "puncture") return this.askDepth();
+    if (what === "needle-out") return this.ask(h("p", {}, words.needleOutWhy), words.needleOutSure, post("needle-out"));
+    if (what === "calibration") return this.ask([h("p", {}, words.drivesWhy), this.drives()], words.drivesSure, post("calibration"));
     return act(what);
+  }
+
+  // The second step of what is not done by one click: the answer lies below what is asked.
+  ask(question, yes, run) {
+    replace(byId("actions"), question,
+      h("button", { type: "button", onclick: () => this.actions(this.state) }, words.cancel),
+      h("button", { type: "button", class: "apart", onclick: () => act(run).then(() => this.actions(this.state)) }, yes));
+  }
+
+  drives() {
+    return h("ul", {}, this.state.calibration_drives.map(({ axis, stops_mm: stops }) => h("li", {}, words.drives(axis, stops.map((at) => mm(at, 1)).join(" → ")))));
   }
 
   askDepth() {

@@ -254,7 +254,9 @@ class ControlLoop:
             raise  # the procedure stays `running`: the next start goes on with it
         except ProcedureAbortedError as error:
             self._end_procedure(running, "aborted", str(error))
-        except (ProcedureFailedError, ReplayMismatchError) as error:
+        except ProcedureFailedError as error:
+            self._end_procedure(running, "failed", str(error), error.code)
+        except ReplayMismatchError as error:
             self._end_procedure(running, "failed", str(error))
         except RECORD_FAULTS as error:
             # the record could be written in between, and yet: then it is not the record's fault
@@ -275,10 +277,11 @@ class ControlLoop:
         text = f"the program failed ({type(error).__name__}: {error}); its log says where"
         self._end_procedure(running, "failed", text)
 
-    def _end_procedure(self, running: Procedure, state: str, reason: str) -> None:
+    def _end_procedure(self, running: Procedure, state: str, reason: str, code: str = "") -> None:
         body = {"procedure_id": running.procedure_id, "name": running.name, "reason": reason}
+        result = {"reason": reason, "code": code}
         with self._record.transaction():
-            self._record.end_procedure(running.procedure_id, state, {"reason": reason})
+            self._record.end_procedure(running.procedure_id, state, result)
             self._record.append_event(f"procedure_{state}", body, source="service")
 
     def _finish_procedure(self, running: Procedure, result: Any) -> None:

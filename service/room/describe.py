@@ -9,7 +9,7 @@ from typing import Any
 from case_record.cases import Cases
 from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
-from case_record.rows import Measurement, SliceRow
+from case_record.rows import Measurement, Procedure, SliceRow
 from room_config.load import Config
 from service.procedure.targets import (
     Target,
@@ -35,13 +35,14 @@ from service.room.history import arrival_by_hand, rests_on_slices
 from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
 from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
-from service.room.prompt import is_calibrated, is_punctured, outcome_text, prompt
+from service.room.prompt import is_calibrated, is_punctured, next_action, outcome_text, prompt
 from service.room.proposals import ProposalBook
 from service.room.scanner_clock import clock_update
 from service.room.state import (
     AcquisitionState,
     ArrivalState,
     CaseState,
+    DriveState,
     FiducialState,
     HoldState,
     LostState,
@@ -102,6 +103,8 @@ class Describer:
                 "prompt": prompt(config, record, link, execution, found) + _marked(arrival),
                 "ready": arrival is not None,
                 "ready_lost": _lost_ready(found),
+                "next_action": next_action(config, record, link, execution, found),
+                "calibration_drives": _drives(config, link),
                 "arrival": arrival,
                 "punctured": found is not None and is_punctured(record, found.procedure_id),
                 "robot": describe_robot(link, before.robot),
@@ -200,11 +203,19 @@ def _procedures(record: CaseRecord, execution: Execution) -> dict[str, Any]:
         "procedure": running.name if running else None,
         "procedure_id": running.procedure_id if running else None,
         "last_outcome": outcome_text(ended.name, ended.state, ended.result) if ended else "",
+        "last_failure": _failure(ended) if running is None else None,
         "acquisition_request": AcquisitionState(**vars(request)) if request else None,
         "question": QuestionState(**{**vars(question), "choices": list(question.choices)})
         if question
         else None,
     }
+
+
+def _failure(ended: Procedure | None) -> str | None:
+    """The code of the failure with which the last procedure ended; None unless it failed."""
+    if ended is None or ended.state != "failed":
+        return None
+    return str((ended.result or {}).get("code", ""))
 
 
 def _case(record: CaseRecord) -> CaseState | None:
@@ -261,6 +272,23 @@ def _arrival(record: CaseRecord, found: Readiness | None, now: Now) -> ArrivalSt
 def _marked(arrival: ArrivalState | None) -> str:
     """An overrule is never out of sight where READY rests on it."""
     return "" if arrival is None or not arrival.by_hand else " (rests on slices used by hand)"
+
+
+def _drives(config: Config, link: RoomLink) -> list[DriveState]:
+    """What a calibration would drive, and how far: said before it is ordered."""
+    status = link.status
+    if status is None:
+        return []
+    guide = config.service.guide
+    axes = config.service.axes if guide is None else guide.axes
+    move_mm = (guide or config.service).calibration_move_mm
+    drives = []
+    for axis in axes:
+        low_um, high_um = link.travel_um.get(axis, (0, 0))
+        middle_mm = (low_um + high_um) // 2 / 1000
+        stops_mm = (status.positions_um.get(axis, 0) / 1000, middle_mm, middle_mm + move_mm)
+        drives.append(DriveState(axis=axis, stops_mm=(*stops_mm, middle_mm)))
+    return drives
 
 
 def _lost_ready(found: Readiness | None) -> LostState | None:

@@ -139,6 +139,13 @@ class ArrivalState(_Frozen):
     by_hand: bool = False
 
 
+class DriveState(_Frozen):
+    """What a calibration drives: one axis from where it stands, stop by stop."""
+
+    axis: str
+    stops_mm: tuple[float, ...]
+
+
 class SliceState(_Frozen):
     """The slice to show, and where its pixels are in the patient (LPS mm)."""
 
@@ -213,10 +220,13 @@ class RoomState(_Frozen):
     procedure: str | None = None
     procedure_id: int | None = None
     last_outcome: str = ""
+    last_failure: str | None = None
     prompt: str = ""
     ready: bool = False
     ready_lost: LostState | None = None
     ready_valid_s: float
+    next_action: str = ""
+    calibration_drives: list[DriveState] = []
     arrival: ArrivalState | None = None
     robot: RobotState = RobotState()
     acquisition_request: AcquisitionState | None = None

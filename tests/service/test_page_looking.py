@@ -201,6 +201,7 @@ def test_motion_is_locked_for_the_needle_by_hand_and_unlocked(
     expect(page.locator("#chips")).to_contain_text("Motion locked")
     expect(page.get_by_role("button", name="xt plus 1 mm")).to_be_disabled()
     page.get_by_role("button", name="Needle withdrawn – unlock motion").click()
+    page.get_by_role("button", name="Yes, the needle is out").click()
     expect(page.locator("#chips")).not_to_contain_text("Motion locked")
 
 
