@@ -97,7 +97,8 @@ def test_an_order_that_the_browser_held_back_is_not_carried_out_late(
     late = {"X-Asked-At": str(time.monotonic() - 10)}
     body = {"axis": "xt", "distance_um": 500}
     answer = httpx.post(f"{room.url}/api/v1/jog", json=body, headers=late)
-    assert (answer.status_code, answer.json()["title"]) == (409, "stale_order")
+    assert answer.status_code == 409
+    assert answer.json()["title"] in ("stale_order", "void_after_stop")
     assert client.state().robot.positions_um == at_um
 
 
