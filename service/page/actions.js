@@ -113,14 +113,18 @@ export class Next {
     box.hidden = !question;
     if (!question) return replace(box);
     const plan = question.plan;
+    const enable = (on) => buttons.forEach((button) => { button.disabled = !on; });
+    const answer = async (choice) => {
+      enable(false); // one click is one answer
+      const body = { question_id: question.question_id, choice, ...(plan ? { plan_id: plan.plan_id } : {}) };
+      if (!await act(() => order("POST", "api/v1/answer", body))) enable(true);
+    };
     const buttons = question.choices.map((choice) => h("button", {
       type: "button", class: choice === question.choices[0] ? "main" : null,
       id: choice === "confirm" ? "confirm" : null, disabled: true,
-      onclick: () => act(() => order("POST", "api/v1/answer", {
-        question_id: question.question_id, choice, ...(plan ? { plan_id: plan.plan_id } : {}),
-      })),
+      onclick: () => answer(choice),
     }, labelOf(choice)));
-    if (this.mayAct) setTimeout(() => buttons.forEach((button) => { button.disabled = false; }), READ_FIRST_MS);
+    if (this.mayAct) setTimeout(() => enable(true), READ_FIRST_MS);
     replace(box, h("div", { class: "answers" }, buttons), plan ? planTable(plan, state) : null);
   }
 }
