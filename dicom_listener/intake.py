@@ -24,6 +24,7 @@ from dicom_listener.assign import (
     HoldWindow,
     Known,
     Pending,
+    Quarantined,
     assign,
 )
 from dicom_listener.case_gate import CaseGate
@@ -289,6 +290,9 @@ class Intake:
         return [*self._known.values(), *siblings]
 
     def _assign(self, slice_: Slice, received_s: float, known: Sequence[Known]) -> Decision:
+        wrong = self._clocks.wrong_duration(slice_, received_s)
+        if wrong and not self._rules.assign.arrival_mode:
+            return Quarantined(Reason.IMPLAUSIBLE_TIME, wrong)
         return assign(
             slice_,
             received_s,

@@ -37,6 +37,9 @@ _OTHER_MAPS = {"B0", "B0 MAP", "B1", "FIELD_MAP", "FIELDMAP", "FREQUENCY MAP", "
 _LOCALIZER_TITLES = ("localizer", "localiser", "locator", "scout", "survey", "3-plane", "3 plane")
 
 
+_UNITS_APART = 30.0  # an estimate may be that far off, and seconds are still told from ms
+
+
 class Kind(StrEnum):
     """What the pixels of a frame are."""
 
@@ -93,6 +96,28 @@ def ge_duration_s(top: Elements) -> float | None:
         return None
     duration_us = top.number(_GE_DURATION)
     return duration_us / 1e6 if duration_us and duration_us > 0 else None
+
+
+def whole_duration_s(top: Elements, estimated_s: float | None) -> float | None:
+    """AcquisitionDuration, in seconds by the standard; UIH writes milliseconds.
+
+    Beside what the sequence itself takes (estimated_s), a value of some other vendor that is a
+    thousand times too long is in milliseconds, too, and one of UIH that fits as it is in seconds.
+    """
+    value = top.number("AcquisitionDuration")
+    if value is None or not value > 0:
+        return None
+    in_ms = top.text("Manufacturer").upper().startswith("UIH")
+    if estimated_s:
+        fits_as_s, fits_as_ms = (
+            1 / _UNITS_APART < v / estimated_s < _UNITS_APART for v in (value, value / 1000)
+        )
+        if fits_as_s != fits_as_ms:
+            in_ms = fits_as_ms
+    if not in_ms:
+        return value
+    top.warnings.append(f"AcquisitionDuration {value:g} was taken as milliseconds")
+    return value / 1000
 
 
 def is_mosaic(top: Elements, image_type: tuple[str, ...]) -> bool:
