@@ -28,15 +28,22 @@ def start_point(
     calibration: Calibration,
     positions_um: Mapping[str, int],
     noise: MotionNoise,
+    *,
+    stood: bool = True,
 ) -> Calibration:
     """Return the calibration as it holds where the robot stands now.
 
-    If anything happened since its last measurement, the fiducial's place is as good as unknown: a
+    stood: as far as the robot's bridge knows, it has not moved since the last measurement. If
+    anything happened since then, the fiducial's place is as good as unknown: a
     procedure that starts from it looks before it moves.
     """
     estimate = calibration.estimate
     here = dict(positions_um)
-    if dict(estimate.setpoints_um) == here and is_untouched(record, calibration.measurement_id):
+    if (
+        stood
+        and dict(estimate.setpoints_um) == here
+        and is_untouched(record, calibration.measurement_id)
+    ):
         return calibration
     moved = estimate.moved_to(here, calibration.jacobian, noise)
     unseen = np.eye(len(moved.plane_mm)) * _UNSEEN_MOVE_MM**2

@@ -21,7 +21,7 @@ from service.room.belief.goal import effective
 from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
-from service.room.present import Now
+from service.room.present import RESTS_ON, Now
 from service.room.readiness import ConflictError
 from service.room.stop_latch import StopLatch
 
@@ -107,11 +107,20 @@ class Room:
             )
         status = self.linked()
         noise = gate_of(self.config).noise
-        return start_point(self.record, calibration, status.positions_um, noise)
+        stood = self._has_stood(calibration.measurement_id)
+        return start_point(self.record, calibration, status.positions_um, noise, stood=stood)
+
+    def _has_stood(self, measurement_id: int) -> bool:
+        """Whether the bridge knows of no motion since a measurement, parking and restarts too."""
+        facts = self.record.measurement(measurement_id).request.get(RESTS_ON, {})
+        status = self.linked()
+        then = (facts.get("boot_id"), facts.get("last_motion"))
+        return then == (status.boot_id, status.last_motion)
 
     def is_proven(self, start: Calibration) -> bool:
         """Whether what a start point says was seen to move with the robot, and not lost since."""
-        return is_proven(self.record, start, self.linked().positions_um)
+        stood = self._has_stood(start.measurement_id)
+        return stood and is_proven(self.record, start, self.linked().positions_um)
 
     def proof_arguments(self, start: Calibration) -> ProofArguments:
         confirm, travel_um = self.config.service.confirm_moves, self.link.travel_um

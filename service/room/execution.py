@@ -158,7 +158,12 @@ class Execution:
             try:
                 if not self._stands_in_motion_phase(phase):
                     self._link.enter_phase(phase, _SERVICE)
-                outcome = self._link.client.move(command_id, step.setpoints_um, measurement)
+                outcome = self._link.client.move(
+                    command_id,
+                    step.setpoints_um,
+                    measurement,
+                    based_on_motion=self._based_on_motion(step),
+                )
             except LinkLostError as error:
                 self._link.lost(error)
                 self._permitted.interrupt()
@@ -166,6 +171,16 @@ class Execution:
             except RefusedError as error:
                 outcome = MoveOutcome(command_id, CommandState.REFUSED, error.code, error.text, {})
             return self._settled(step, outcome)
+
+    def _based_on_motion(self, step: MoveTo) -> str | None:
+        """The motion after which the measurement was taken on which a move rests; of one that
+        rests on none, the last one. None where the record does not say.
+        """
+        if step.rests_on is None:
+            status = self._link.status
+            return None if status is None else status.last_motion
+        facts = self._record.measurement(step.rests_on).request.get(RESTS_ON)
+        return None if facts is None else str(facts["last_motion"])
 
     def _why_void(self, step: MoveTo, command_id: str) -> str:
         """Why the plan behind a move is void; a move that was sent is only asked for again."""

@@ -457,3 +457,14 @@ def test_a_target_is_judged_when_it_is_set(room, place_mm, in_water, code):
         room.call("set_target", patient_mm=patient_mm(*place_mm), in_water=in_water)
     assert refused.value.code == code
     assert room.later().target_patient_mm is None
+
+
+@pytest.mark.parametrize("emergency", [False, True])
+def test_after_a_stop_the_room_comes_to_ready_again(room, emergency):
+    """Parking shifts the stages a little: what was measured after it counts, nothing before."""
+    room.ready()
+    room.stop(emergency=emergency)
+    room.until(lambda s: s.ready_lost is not None)
+    room.arm()
+    room.call("needle_out")
+    assert room.ready(-1.0, 1.0).ready
