@@ -195,6 +195,8 @@ def _slices_of(data_set: Dataset, times: TimeFrame, noted: list[str]) -> list[Sl
 def _check_is_mr(sop_class: str, modality: str) -> None:
     if sop_class in quirks.MR_CLASSES or (not sop_class and modality == "MR"):
         return
+    if quirks.is_camera(sop_class, modality):
+        return
     if sop_class.startswith("1.2.840.10008.5.1.4.1.1.7"):
         raise UnusableError(Reason.SCREEN_SAVE, "a secondary capture (screen save), not MR data")
     what = modality or sop_class or "an object without modality"
@@ -219,7 +221,7 @@ def _slice(
         geometry_problem=geometry_problem,
         interval=interval,
         time_problem=time_problem,
-        kind=quirks.kind_of(frame, image_type),
+        kind=_kind(frame, image_type),
         is_mosaic=quirks.is_mosaic(top, image_type),
         is_localizer=quirks.is_localizer(image_type, description),
         distortion_corrected=quirks.is_distortion_corrected(image_type),
@@ -249,6 +251,13 @@ def _slice(
         warnings=tuple(dict.fromkeys(top.warnings)),
         patient_digest=patient_digest(top),
     )
+
+
+def _kind(frame: FrameElements, image_type: tuple[str, ...]) -> Kind:
+    top = frame.top
+    if quirks.is_camera(top.text("SOPClassUID"), top.text("Modality").upper()):
+        return Kind.CAMERA
+    return quirks.kind_of(frame, image_type)
 
 
 def _number(keyword: str) -> Any:

@@ -10,6 +10,7 @@ from dicom_slice.elements import Elements, FrameElements
 MR_IMAGE = "1.2.840.10008.5.1.4.1.1.4"
 ENHANCED_MR_IMAGE = "1.2.840.10008.5.1.4.1.1.4.1"
 LEGACY_ENHANCED_MR_IMAGE = "1.2.840.10008.5.1.4.1.1.4.4"
+SECONDARY_CAPTURE = "1.2.840.10008.5.1.4.1.1.7"
 MR_CLASSES = (MR_IMAGE, ENHANCED_MR_IMAGE, LEGACY_ENHANCED_MR_IMAGE)
 
 _GE_IMAGE_TYPE = (0x0043, 0x102F)
@@ -48,6 +49,12 @@ class Kind(StrEnum):
     REAL = "real"
     IMAGINARY = "imaginary"
     OTHER = "other"
+    CAMERA = "camera"
+
+
+def is_camera(sop_class: str, modality: str) -> bool:
+    """A slice of the bench: a secondary capture that an external camera took (`bench`)."""
+    return sop_class == SECONDARY_CAPTURE and modality == "XC"
 
 
 def kind_of(frame: FrameElements, image_type: tuple[str, ...]) -> Kind:

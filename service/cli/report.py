@@ -68,14 +68,17 @@ def report_page(record: CaseRecord) -> str:
     case = record.case()
     if case is None:
         raise ReportError(f"{record.case_dir}: no case was begun here")
-    events = record.verify_events()
+    whole = record.verify()
     described = record.last_event("case_described")
     name = (described.body.get("label") if described else "") or case.name
     title = f"{name}: {time_text(case.created_s)}"
     body = [
         f"<h1>{html.escape(title)}</h1>",
         '<p class="warning">Research software, not a medical device.</p>',
-        f"<p>Case {html.escape(case.case_uid)}, {events} events, their chain verifies.</p>",
+        (
+            f"<p>Case {html.escape(case.case_uid)}, {whole.events} events; the record "
+            f"verifies, its head is <code>{whole.head}</code>.</p>"
+        ),
         *case_table(record),
         *punctures(record),
         *_targets(record),
