@@ -57,6 +57,9 @@ def conditions(state: RoomState) -> list[Condition]:
         text = f"READY was lost: {state.ready_lost.text}"
         what = "Confirm that the needle is withdrawn, then start the approach: it measures again."
         found.append(Condition("ready_lost", "alarm", text, what))
+    if state.target_lost is not None:
+        text = f"The target is void: {state.target_lost.text}"
+        found.append(Condition("target_void", "alarm", text, "Pick the target on the new slices."))
     if state.last_failure is not None and state.last_failure not in _CHOSEN:
         what = _AFTER_FAILURE.get(state.last_failure, "Read the reason, then start it again.")
         text = state.last_outcome[:1].upper() + state.last_outcome[1:].replace("_", " ")

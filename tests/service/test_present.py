@@ -342,6 +342,7 @@ def test_a_target_is_void_once_the_table_may_have_moved_until_it_is_picked_anew(
     room.receive(frame_of_reference_uid="1.2.8")
     state = room.until(lambda s: s.target_lost is not None)
     assert state.target_patient_mm is None
+    assert "target_void" in {alarm.code for alarm in state.alarms}
     assert not state.calibrated  # the estimate and its plane mean nothing on a moved table
     number = _number_of_the_target(room)
     for order in (lambda: None, lambda: room.call("choose_target", number=number)):
@@ -468,3 +469,36 @@ def test_after_a_stop_the_room_comes_to_ready_again(room, emergency):
     room.arm()
     room.call("needle_out")
     assert room.ready(-1.0, 1.0).ready
+
+
+def test_a_failed_procedure_is_an_alarm_that_says_what_to_do(room):
+    room.calibrate()
+    room.call("set_target", patient_mm=patient_mm(41.0, 58.0))
+    room.do(lambda: setattr(room, "fiducial_visible", False))
+    room.call("start_approach")
+    state = room.run_to_end(lambda s: "abort" if "abort" in s.question.choices else "confirm")
+    assert state.last_failure == "nothing_round"
+    alarm = next(one for one in state.alarms if one.code == "procedure_failed")
+    assert alarm.severity == "alarm"
+    assert "nothing round" in alarm.text
+    assert alarm.what_to_do
+    room.do(lambda: setattr(room, "fiducial_visible", True))
+    state = room.ready()
+    assert "procedure_failed" not in {one.code for one in state.alarms}
+
+
+def test_what_to_do_next_has_a_name_and_what_a_calibration_drives_is_said_before(room):
+    state = room.until(lambda s: s.robot.linked and s.next_action)
+    assert state.next_action == "reset"
+    room.arm()
+    state = room.until(lambda s: s.next_action == "calibration")
+    drives = {one.axis: one.stops_mm for one in state.calibration_drives}
+    assert drives == {"xt": (0.0, 0.0, 6.0, 0.0), "yt": (0.0, 0.0, 6.0, 0.0)}
+    room.calibrate()
+    assert room.until(lambda s: s.next_action == "target")
+    room.call("set_target", patient_mm=patient_mm(41.0, 58.0))
+    assert room.until(lambda s: s.next_action == "approach")
+    room.call("start_approach")
+    assert room.until(lambda s: s.ready).next_action == "puncture"
+    room.call("puncture")
+    assert room.until(lambda s: s.punctured).next_action == "needle-out"
