@@ -104,6 +104,7 @@ export const TEXTS = {
     inTissueWhy: "Oil in the fiducial and water in tissue appear shifted against each other in the slice. Tick this for an anatomical target: the shift is then corrected.",
     distance: (mm, where) => `${mm} mm from the fiducial${where ? `: ${where}` : ""}.`,
     reachable: "Within the robot's travel.", unreachable: (axis, mm, low, high) => `Out of reach: axis ${axis} would have to go to ${mm} mm (travel ${low} to ${high} mm).`,
+    empty: (field) => `Not set: ${field} is empty.`,
     reachUnknown: "Reach is known after a calibration.",
     setTarget: "Set target", setEntry: "Set entry point", withdraw: "Withdraw the target", cancel: "Cancel",
     notSlice: "The point lies in the slice that is shown.",

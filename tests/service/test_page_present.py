@@ -2,6 +2,7 @@
 button, an overrule gives its reason, and all tabs of a browser share one event stream.
 """
 
+import re
 import time
 from pathlib import Path
 
@@ -182,3 +183,19 @@ def test_a_slice_is_offered_for_its_own_hold_only_and_a_reason_is_asked_for(
         assert client.slice(early).offered_hold_id is None
         page.close()
     assert complaints == []
+
+
+def test_while_a_target_is_picked_the_reach_is_drawn_and_a_cleared_field_is_an_error(
+    page: Page, client: RoomClient
+) -> None:
+    calibrated(client)
+    before = client.state().event_id
+    page.get_by_role("button", name="Pick target").click()
+    expect(page.locator("#reach").first).to_have_attribute(
+        "points", re.compile(r"^(-?[\d.]+,-?[\d.]+ ?){4}$")
+    )
+    page.locator("#pick-x").fill("")
+    page.get_by_role("button", name="Set target", exact=True).click()
+    expect(page.locator("#refusal")).to_contain_text("is empty")
+    assert "target_set" not in {event.kind for event in client.events(after=before)}
+    page.get_by_role("button", name="Cancel").click()
