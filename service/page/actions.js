@@ -23,9 +23,11 @@ export function actionsFor(state) {
   add("reset", robot.stopped ? words.rearm : words.arm, post("reset"),
     robot.linked && !robot.moving && (robot.stopped || !robot.armed || !robot.position_certain));
   add("puncture", words.puncture, "puncture", state.ready && robot.insertion_locked && !state.punctured);
-  add("approach", words.approach, post("approach"), free && state.calibrated && state.target_patient_mm && (!state.guide || state.entry_patient_mm));
+  const planned = state.target_patient_mm && (!state.guide || state.entry_patient_mm);
+  add("approach", words.approach, post("approach"), free && state.calibrated && planned);
+  add(state.target_patient_mm ? "entry" : "target", words.pick, "pick", free && state.calibrated && !planned && state.slice);
   add("calibration", words.calibrate, "calibration", free);
-  add("target", words.targetHere, post("target/here"), free && state.calibrated && !state.guide);
+  add("target-here", words.targetHere, post("target/here"), free && state.calibrated && !state.guide);
   const wanted = state.acquisition_request;
   add("acquisition", words.acquired(wanted?.hold_id), post("acquisition", { hold_id: wanted?.hold_id }), state.arrival_mode && wanted);
   add("abort", words.abort, post("abort"), !idle);
@@ -46,7 +48,9 @@ const drawChips = whenChanged((robot) => {
 });
 
 export class Next {
-  constructor() {
+  // onPick: begins to pick a target on the slice
+  constructor(onPick) {
+    this.onPick = onPick;
     this.drawActions = whenChanged((key, state) => this.actions(state));
     this.drawQuestion = whenChanged((question, state) => this.question(question, state));
     this.mayAct = true;
@@ -80,6 +84,7 @@ export class Next {
     if (what === "puncture") return this.askDepth();
     if (what === "needle-out") return this.ask(h("p", {}, words.needleOutWhy), words.needleOutSure, post("needle-out"));
     if (what === "calibration") return this.ask([h("p", {}, words.drivesWhy), this.drives()], words.drivesSure, post("calibration"));
+    if (what === "pick") return this.onPick();
     return act(what);
   }
 

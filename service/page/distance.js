@@ -1,7 +1,7 @@
 // The distance to the target with its uncertainty, large; and the close-up of target and fiducial.
 
 import { byId, h, replace, s, setText, whenChanged } from "./dom.js";
-import { mm, NONE, percent } from "./format.js";
+import { mm, NONE, percent, sentence } from "./format.js";
 import { ellipse, inWords } from "./geometry.js";
 import { TEXTS } from "./texts.js";
 
@@ -58,7 +58,7 @@ export const drawNumbers = whenChanged(({ error: ofFiducial, measurement, tolera
   const rows = rowsOf(measurement);
   if (!error) {
     const failed = measurement?.state === "failed" ? words.noFiducial(measurement.reason) : "";
-    const why = failed || (guide ? words.atReady : reason || words.nothing);
+    const why = failed || (guide ? words.atReady : sentence(reason) || words.nothing);
     replace(body, h("p", { class: "big quiet" }, NONE, h("small", {}, " mm")), h("p", { class: "quiet" }, why),
       rows.length ? h("table", {}, h("tbody", {}, rows)) : null);
     return;

@@ -148,7 +148,7 @@ export class Images {
   // Window and level: automatic for each image, or one choice relative to the automatic one. The
   // automatic one spans the whole fiducial: its plateau and edge are not burnt out.
   levels(view) {
-    const own = levelsOf(view, this.state?.measurement);
+    const own = levelsOf(view, view === this.sr ? this.state?.reconstruction : this.state?.measurement);
     if (!this.manual) return own;
     return { window: own.window * this.manual.window, level: own.level + own.window * this.manual.level };
   }

@@ -24,7 +24,7 @@ import { TEXTS } from "./texts.js";
 
 const page = { state: null, role: "viewer", measurements: [], connected: false };
 const images = new Images(byId("images"));
-const next = new Next();
+const next = new Next(() => images.picking.toggle());
 const stop = new StopButton(byId("stop"), byId("stop-said"));
 guard(byId("next"));
 

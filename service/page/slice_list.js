@@ -37,7 +37,11 @@ export class SliceList {
   // Called when a slice came or was decided about; shownId: the one in the image
   async refresh(shownId) {
     this.shownId = shownId;
-    this.rows = await get(`api/v1/slices?newest=true&limit=${AT_ONCE}`);
+    this.asked = (this.asked ?? 0) + 1;
+    const { asked } = this;
+    const rows = await get(`api/v1/slices?newest=true&limit=${AT_ONCE}`);
+    if (asked !== this.asked) return; // a later answer came first
+    this.rows = rows;
     this.draw();
   }
 

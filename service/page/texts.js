@@ -36,7 +36,7 @@ export const TEXTS = {
     arm: "Arm the robot", rearm: "Re-arm the robot",
     needleOut: "Needle withdrawn – unlock motion",
     puncture: "Record the puncture", depth: "Insertion depth, mm (optional)", punctured: "Puncture recorded.",
-    approach: "Start the approach", calibrate: "Start the calibration", targetHere: "Set the target to where the fiducial is now",
+    approach: "Start the approach", pick: "Pick the target on the slice", calibrate: "Start the calibration", targetHere: "Set the target to where the fiducial is now",
     acquired: (hold) => `Slices for hold ${hold} acquired`,
     abort: "End the procedure",
     needleOutSure: "Yes, the needle is out of the patient – unlock",

@@ -36,12 +36,12 @@ PROBABILITY, PAPER = "probability", "paper"
 class ApproachArguments(SteeringArguments):
     """What an approach is told.
 
-    target_mm: (2,) of the fiducial. stop_rule: `probability` (READY only with
-    P(error < tolerance) >= confidence) or `paper` (error below one pixel of the image looked at;
-    for the paper's studies). seed: of the random shift sets.
+    target_mm: (2,) of the fiducial. strategy: a name, or one of your own. stop_rule: `probability`
+    (READY only with P(error < tolerance) >= confidence) or `paper` (error below one pixel of the
+    image looked at; for the paper's studies). seed: of the random shift sets.
     """
 
-    strategy: str = "adaptive"
+    strategy: str | Strategy = "adaptive"
     stop_rule: str = PROBABILITY
     seed: int = 0
 
@@ -80,7 +80,8 @@ class SteeredFiducial:
 
     @property
     def strategy(self) -> Strategy:
-        return STRATEGIES[self.arguments.strategy]
+        chosen = self.arguments.strategy
+        return chosen if isinstance(chosen, Strategy) else STRATEGIES[chosen]
 
     def look(
         self, calibration: Calibration, way: Way, *, number: int, fresh: bool

@@ -34,7 +34,7 @@ def _idle_prompt(
     if found is not None and found.ready:
         if is_punctured(record, found.procedure_id):
             return "Puncture recorded. Withdraw the needle, then unlock motion."
-        return "READY: make the puncture, then confirm that the needle is withdrawn."
+        return "READY: make the puncture."
     if status.phase is WorkPhase.EMERGENCY:
         return "EMERGENCY: the drives are parked. See to the patient and the needle, then re-arm."
     if status.stopped:

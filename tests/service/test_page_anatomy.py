@@ -45,7 +45,7 @@ def test_a_target_is_picked_on_a_planning_slice_at_another_depth(
     assert state.slice is not None
     depth_mm = state.slice.position_mm[1] + DEPTH_MM
     number = send_planning_slice(room, client)
-    thumb = page.get_by_role("button", name=re.compile(f"^{number} (planning|set aside)"))
+    thumb = page.get_by_role("button", name=re.compile(f"^{number} (planning|set aside|waiting)"))
     expect(thumb).to_contain_text(f"P {depth_mm:.1f}")
     thumb.click()
     what = page.locator(".view .what").first
