@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import time
 
-from dicom_listener.by_hand import why_not_by_hand
-from dicom_listener.overrule import give_up_slices, reassign, reset_clock
+from dicom_listener.overrule import give_up_slices, reassign, reset_clock, why_not_by_hand
 from service.room.context import Room
 from service.room.readiness import ConflictError
 
