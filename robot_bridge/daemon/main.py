@@ -283,6 +283,8 @@ def run_bridge(
     exit_with_parent: bool = False,
 ) -> str:
     """The whole life of `python -m robot_bridge`; returns why it ended. Raises StartError."""
+    if not config.link:
+        raise StartError("bridge.link is missing: the line to the service (a bench needs --direct)")
     guardian = make_guardian(config) if config.guardian else None
     try:
         daemon = _start(config, make_motors, guardian, exit_with_parent)

@@ -171,7 +171,7 @@ class PmdAxis(PmdController):
         except PmdNoValueError:  # no echo: what it does is seen below, and a target is absolute
             self.doubts["T"] = "a motion is not confirmed by an echo"
         told_near = False
-        watch = _ProgressWatch(self, abs(setpoint_um - self.position_um), self._clock())
+        watch = _ProgressWatch(self, abs(setpoint_um - self.position_um), self.clock())
         while True:
             yield Pause(POLL_PAUSE_S)
             status = yield from self.read_status()
@@ -190,7 +190,7 @@ class PmdAxis(PmdController):
                 if "T" in self.doubts and error_um <= self.jitter_um:
                     break  # a board that knows no target mode
                 raise self.error("stopped", f"left target mode {error_um:.0f} um short")
-            watch.check(error_um, self._clock())
+            watch.check(error_um, self.clock())
         yield from self._leave_target_mode()
         yield from self._forget_stored()
         yield from self.read_position_surely()
@@ -221,7 +221,7 @@ class PmdAxis(PmdController):
     def _run_counted(self, go: Command, microsteps: int, *, anywhere: bool = False) -> Steps[None]:
         phase = yield from self._microstep_phase()
         expected = None if phase is None else (phase + microsteps) % MICROSTEPS_PER_STEP
-        run = _Run(self.position_um, microsteps, self.speed_hz, self._clock())
+        run = _Run(self.position_um, microsteps, self.speed_hz, self.clock())
         self._run = run
         self.at_rest_um = None
         try:
@@ -280,7 +280,7 @@ class PmdAxis(PmdController):
             # `J` reads 0 after a run; during one it reads 1 or +-222, depending on the unit.
             if not status & Status.RUNNING and (yield from self.ask("J")).integer() == 0:
                 return
-            if self._clock() > deadline_s:
+            if self.clock() > deadline_s:
                 raise self.error("motion_timeout", f"runs longer than {run.duration_s:.1f} s")
             yield Pause(POLL_PAUSE_S)
 
@@ -295,7 +295,7 @@ class PmdAxis(PmdController):
         return values[1]
 
     def _estimate_um(self, run: _Run) -> float:
-        part = min(1.0, (self._clock() - run.begun_s) / max(run.duration_s, 1e-6))
+        part = min(1.0, (self.clock() - run.begun_s) / max(run.duration_s, 1e-6))
         return run.from_um + part * pmd_units.um_from_microsteps(self.config, run.microsteps)
 
     # Reference

@@ -39,7 +39,8 @@ def initialise(c: PmdController) -> Steps[None]:
     yield from _identify(c)
     yield from _stop(c)
     c.mark = mark = yield from _read_mark(c)
-    first = yield from _first_status(c)
+    c.status_body = "U" if c.config.estop_input is None else "U4"  # with the inputs
+    first = yield from c.read_status()
     yield from c.read_status()  # what was latched is cleared now
     declared = mark == DECLARED_MARK and not first & Status.RESET
     yield from _probe_storing(c)
@@ -104,16 +105,6 @@ def _stop(c: PmdController) -> Steps[None]:
         yield pmd_protocol.stop(c.address)
     except PmdNoValueError:
         c.doubts["S"] = "a stop is not confirmed by an echo"
-
-
-def _first_status(c: PmdController) -> Steps[Status]:
-    """Find out which form of the question the controller understands."""
-    c.status_body = "U"
-    try:
-        return (yield from c.read_status())
-    except PmdError:
-        c.status_body = "U0"
-    return (yield from c.read_status())
 
 
 def _read_mark(c: PmdController) -> Steps[int | None]:
