@@ -21,6 +21,7 @@ from case_record.cases import Cases
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Procedure
 from room_config.load import Config
+from service.procedure.calibration import Calibration
 from service.procedure.guide_recording import GuidePlace
 from service.procedure.recording import Place
 from service.procedure.registry import build_procedure, result_to_json
@@ -35,6 +36,7 @@ from service.room.describe import Describer, describe_robot
 from service.room.execution import Execution, ProcedureAbortedError
 from service.room.link import RoomLink
 from service.room.readiness import ConflictError
+from service.room.stage_witness import correct_counts
 from service.room.state import RoomState
 from service.room.stop_latch import StopLatch
 from service.room.trouble import RECORD_FAULTS, Trouble, held
@@ -287,6 +289,9 @@ class ControlLoop:
             if isinstance(result, Place | GuidePlace):
                 self._make_target(running, result)
             self._record.append_event("procedure_done", body, source="service")
+        known = getattr(result, "calibration", result)
+        if isinstance(known, Calibration):
+            correct_counts(self._record, self._link, known)
 
     def _make_target(self, recorded: Procedure, place: Place | GuidePlace) -> None:
         """The place that was recorded is the target from now on; a needle's line has an entry."""
