@@ -18,6 +18,7 @@ COPY robot_bridge ./robot_bridge
 COPY case_record ./case_record
 COPY room_config ./room_config
 COPY simulator ./simulator
+COPY bench ./bench
 COPY studies ./studies
 RUN pip install --no-cache-dir --no-deps --no-build-isolation . \
     && useradd --create-home autospine && mkdir /case && chown autospine /case

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import sys
 import time
@@ -12,7 +13,7 @@ from typing import Any
 
 from case_record.record import CaseRecord
 from case_record.rows import Measurement
-from service.client import RoomClient
+from service.client import RoomClient, ServiceGoneError
 from service.room.state import RoomState
 from simulator.demo.room import DemoRoom
 
@@ -93,11 +94,14 @@ class Cycle:
 
     def _until(self, wanted: Callable[[RoomState], object]) -> RoomState:
         deadline_s = time.monotonic() + _PATIENCE_S
-        while not wanted(state := self.client.state()):
+        while True:
+            with contextlib.suppress(ServiceGoneError):  # for a moment it does not know
+                state = self.client.state()
+                if wanted(state):
+                    return state
             if time.monotonic() > deadline_s:
-                raise SystemExit(f"the room does not get on: {state.prompt}")
+                raise SystemExit("the room does not get on")
             time.sleep(_LOOK_EVERY_S)
-        return state
 
 
 @dataclass(frozen=True)

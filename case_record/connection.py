@@ -10,6 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
+from case_record import sealing
 from case_record.sql import MIGRATIONS, SCHEMA_VERSION
 
 FILE_NAME = "case.sqlite"
@@ -54,6 +55,7 @@ class Connection:
         where = _read_only_uri(path) if read_only else path.absolute().as_uri()
         self._db = sqlite3.connect(where, timeout=busy_timeout_s, isolation_level=None, uri=True)
         self._db.row_factory = sqlite3.Row
+        sealing.prepare(self._db)
         try:
             if read_only:
                 self._check_schema()
@@ -87,6 +89,7 @@ class Connection:
                 for statement in _statements(MIGRATIONS[number]):
                     self._db.execute(statement)
                 self._db.execute(f"PRAGMA user_version = {number + 1}")
+            sealing.seal_everything(self._db)
 
     def _check_schema(self) -> None:
         version = self._db.execute("PRAGMA user_version").fetchone()[0]

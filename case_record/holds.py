@@ -84,6 +84,11 @@ class Holds(Connection):
         )
         return [_hold(row) for row in rows]
 
+    def newest_holds(self, limit: int) -> list[Hold]:
+        """The newest ones, oldest first."""
+        rows = self._db.execute("SELECT * FROM hold ORDER BY hold_id DESC LIMIT ?", (limit,))
+        return [_hold(row) for row in rows][::-1]
+
     def next_set_id(self) -> int:
         return int(self._db.execute("SELECT COALESCE(MAX(set_id), 0) + 1 FROM hold").fetchone()[0])
 

@@ -18,12 +18,13 @@ from case_record.measurements import Measurements
 from case_record.moves import Moves
 from case_record.procedures import Procedures
 from case_record.rows import Case
+from case_record.seals import Seals
 from case_record.slices import Slices
 
 __all__ = ["FILE_NAME", "CaseRecord", "CaseRecordError", "RecordUnavailableError"]
 
 
-class CaseRecord(Events, Holds, Slices, Measurements, Procedures, Moves):
+class CaseRecord(Events, Holds, Slices, Measurements, Procedures, Moves, Seals):
     """One connection to the record of a case. Use it in the thread that opened it."""
 
     def start_case(self, name: str, seed: int) -> Case:

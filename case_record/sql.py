@@ -163,6 +163,23 @@ MIGRATIONS: tuple[str, ...] = (
     CREATE INDEX slice_by_seq ON slice (seq);
     CREATE INDEX event_by_kind ON event (kind, event_id);
     """,
+    # One chain of hashes over all rows (`seals`, which makes the triggers); no query without index.
+    """
+    CREATE TABLE seal (
+        seal_id INTEGER PRIMARY KEY,
+        tbl     TEXT NOT NULL,
+        row     INTEGER NOT NULL,
+        digest  BLOB NOT NULL,
+        hash    BLOB NOT NULL
+    ) STRICT;
+    CREATE INDEX seal_by_row ON seal (tbl, row, seal_id);
+    CREATE TRIGGER seal_is_never_changed BEFORE UPDATE ON seal
+        BEGIN SELECT RAISE(ABORT, 'seals are append-only'); END;
+    CREATE INDEX measurement_by_state ON measurement (state, measurement_id);
+    CREATE INDEX procedure_by_name ON procedure (name, state, procedure_id);
+    CREATE INDEX hold_by_set ON hold (set_id);
+    CREATE INDEX slice_by_sha256 ON slice (sha256);
+    """,
 )
 
 SCHEMA_VERSION = len(MIGRATIONS)

@@ -229,6 +229,7 @@ class Observation:
     jump: str = ""
     late: str = ""
     unlike: str = ""
+    duration: str = ""
 
 
 def observe(clock: ScannerClock, slice_: Received, rules: ClockRules) -> Observation:
@@ -237,6 +238,9 @@ def observe(clock: ScannerClock, slice_: Received, rules: ClockRules) -> Observa
     A lag below what is believed is impossible unless the scanner's clock was set forward, or what
     is believed was wrong: nothing is assigned by it until somebody has compared the clocks again.
     """
+    duration = wrong_duration(slice_, clock.bounds_for(slice_, rules), rules)
+    if duration:
+        return Observation(clock, duration=duration)
     jump = _contradiction(clock, slice_, rules)
     sooner = "" if jump else _break_of_habit(clock, slice_)
     late = "" if jump else _lateness(clock, slice_, rules)
@@ -248,6 +252,26 @@ def observe(clock: ScannerClock, slice_: Received, rules: ClockRules) -> Observa
     return Observation(seen, jump or sooner, late, _unlike_measured(clock, slice_, rules))
 
 
+def wrong_duration(slice_: Received, offset: Offset, rules: ClockRules) -> str:
+    """Why its end cannot be true though its start may be; empty where nothing says so.
+
+    A short acquisition that ends after it was received may as well show a clock set forward.
+    """
+    interval = slice_.interval
+    if isinstance(offset, OffsetUnknown) or interval.end_s is None or interval.estimated:
+        return ""
+    length_s = interval.end_s - interval.start_s
+    if not length_s > rules.longest_acquisition_s:
+        return ""
+    since_start_s = slice_.received_s - interval.start_s - offset.low_s
+    if not -rules.jump_tolerance_s <= since_start_s < length_s - rules.jump_tolerance_s:
+        return ""
+    return (
+        f"its duration of {length_s:.1f} s is wrong: it was here {max(0.0, since_start_s):.1f} s "
+        "after its start"
+    )
+
+
 def _contradiction(clock: ScannerClock, slice_: Received, rules: ClockRules) -> str:
     lag_s = slice_.most_lag_s
     compared = clock.by_comparison(slice_, rules)
@@ -255,13 +279,24 @@ def _contradiction(clock: ScannerClock, slice_: Received, rules: ClockRules) -> 
         least_s = 0.0 if rules.promptness is None else rules.promptness.least_s
         ahead_s = compared.low_s + least_s - lag_s
         if ahead_s > rules.jump_tolerance_s:
-            return f"the scanner's clock is at least {ahead_s:.1f} s ahead of the comparison"
+            return (
+                f"the scanner's clock is at least {ahead_s:.1f} s ahead of the comparison"
+                f"{_of_a_zone(ahead_s)}"
+            )
     if rules.promptness is not None and clock.is_witnessed(rules):
         spread_s = rules.promptness.most_s - rules.promptness.least_s
         ahead_s = clock.least_lags[0][0] - spread_s - lag_s
         if ahead_s > rules.jump_tolerance_s:
             return f"the scanner's clock is at least {ahead_s:.1f} s ahead of before"
     return ""
+
+
+def _of_a_zone(ahead_s: float) -> str:
+    """Clocks that are whole half hours apart mostly differ in what they think is the zone."""
+    halves = round(ahead_s / 1800)
+    if not halves or abs(ahead_s - 1800 * halves) > 60:
+        return ""
+    return " (about whole half hours: look at its time zone, and at scanner_time_zone)"
 
 
 def _break_of_habit(clock: ScannerClock, slice_: Received) -> str:

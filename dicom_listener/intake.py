@@ -24,13 +24,16 @@ from dicom_listener.assign import (
     HoldWindow,
     Known,
     Pending,
+    Quarantined,
     assign,
 )
 from dicom_listener.case_gate import CaseGate
 from dicom_listener.clock import ClockRules, Comparison
+from dicom_listener.copies import what_it_is
 from dicom_listener.holding_area import INBOX, Arrival
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope
 from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.plans import PLAN_RECEIVED, plan_event
 from dicom_listener.scanner_clocks import ScannerClocks
 from dicom_listener.slice_rows import (
     outcome_of,
@@ -169,7 +172,7 @@ class Intake:
         # a sync or reset that was recorded before this slice came must count for it
         self._read_events(replaying=False)
         try:
-            rows, slices = self._rows_of(path, name, envelope, conflict=bool(before))
+            rows, slices = self._rows_of(path, name, envelope, before)
         except sqlite3.Error:
             raise
         except Exception as error:  # a fault of ours must not stop the slices behind this one
@@ -184,6 +187,7 @@ class Intake:
             return
         self._gate.bring_in(path)
         self._write(rows, slices, envelope)
+        self._note_plan(path, rows, envelope)
         self._done.add(name)
         self._decide_pending()
         self._metrics.intake_seconds.observe(max(0.0, time.time() - envelope.received_s))
@@ -235,7 +239,7 @@ class Intake:
         self._event("duplicate_slice", {"sop_instance_uid": envelope.sop_instance_uid})
 
     def _rows_of(
-        self, path: Path, name: str, envelope: Envelope, conflict: bool
+        self, path: Path, name: str, envelope: Envelope, before: Sequence[SliceRow]
     ) -> tuple[list[NewSlice], list[Slice | None]]:
         try:
             slices = self._read(path, envelope)
@@ -248,8 +252,11 @@ class Intake:
             for kind, text in self._clocks.observe(slice_, envelope.received_s):
                 self.alarm(kind, text)
         rows: list[NewSlice] = []
+        known = None
+        if before:
+            known = what_it_is(self._record, self._decoder, path, slices, before)
         for slice_ in slices:
-            against = self._against(slice_, envelope, problems, conflict)
+            against = known or self._against(slice_, envelope, problems)
             decision = against or self._assign(slice_, envelope.received_s, self._known_now(rows))
             arrival_mode = self._rules.assign.arrival_mode
             rows.append(row_of(slice_, envelope, name, decision, arrival_mode=arrival_mode))
@@ -263,12 +270,7 @@ class Intake:
         slice_: Slice,
         envelope: Envelope,
         problems: dict[int, UnusableError],
-        conflict: bool,
     ) -> SetAside | None:
-        if conflict:
-            return SetAside(
-                Reason.UID_CONFLICT, "an instance with this UID and other bytes is already here"
-            )
         stated = slice_.sop_instance_uid
         if stated and stated != envelope.sop_instance_uid:
             return SetAside(
@@ -289,6 +291,9 @@ class Intake:
         return [*self._known.values(), *siblings]
 
     def _assign(self, slice_: Slice, received_s: float, known: Sequence[Known]) -> Decision:
+        wrong = self._clocks.wrong_duration(slice_, received_s)
+        if wrong and not self._rules.assign.arrival_mode:
+            return Quarantined(Reason.IMPLAUSIBLE_TIME, wrong)
         return assign(
             slice_,
             received_s,
@@ -300,7 +305,7 @@ class Intake:
         )
 
     def _holds(self) -> list[HoldWindow]:
-        holds = self._record.holds()[-_HOLDS_LOOKED_AT:]
+        holds = self._record.newest_holds(_HOLDS_LOOKED_AT)
         return [window_of(hold, hold.hold_id in self._confirmed) for hold in holds]
 
     def _write(self, rows: list[NewSlice], slices: list[Slice | None], envelope: Envelope) -> None:
@@ -318,6 +323,15 @@ class Intake:
             self._note_use(slice_, row.hold_id)
         if any(row.reason_code == Reason.UID_CONFLICT for row in rows):
             self.alarm("same_uid_other_bytes", f"{envelope.sop_instance_uid}: both are kept")
+
+    def _note_plan(self, path: Path, rows: list[NewSlice], envelope: Envelope) -> None:
+        """What is no image may be somebody's plan: the service puts it before the operator."""
+        if rows[0].reason_code != Reason.NOT_MR:
+            return
+        here = self._record.case_dir / rows[0].path
+        plan = plan_event(self._record, here if here.exists() else path, envelope)
+        if plan is not None:
+            self._event(PLAN_RECEIVED, plan)
 
     def _note_use(self, slice_: Slice, hold_id: int | None) -> None:
         if hold_id is not None:

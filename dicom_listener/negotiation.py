@@ -1,6 +1,6 @@
 """Which presentation contexts we accept, and a readable account of what was negotiated."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 from pydicom.pixels import get_decoder
@@ -47,6 +47,7 @@ _RESULTS = {
     3: "refused: this kind of object is not stored here",
     4: "refused: none of these encodings can be decoded here",
 }
+_MOST_NAMED = 4
 _REJECTIONS = {
     (1, 1, 1): "no reason given",
     (1, 1, 3): "calling AE title not recognised",
@@ -109,17 +110,18 @@ def as_storage(
 
 @dataclass(frozen=True)
 class NegotiationReport:
-    """Who asked for what, and what we said."""
+    """Who asked for what, and what we said.
+
+    matters: in a line, what of the refused a person must know of: kinds of MR images that cannot be
+    sent in any way. Scanners propose dozens of kinds of objects; most are none of this room's.
+    """
 
     calling_ae_title: str
     called_ae_title: str
     peer: str
     accepted: bool
     lines: tuple[str, ...]
-
-    @property
-    def anything_refused(self) -> bool:
-        return not self.accepted or any("refused" in line for line in self.lines)
+    matters: str = ""
 
     def __str__(self) -> str:
         verdict = "accepted" if self.accepted else "rejected"
@@ -141,13 +143,38 @@ def report_of(association: Association, why_rejected: str = "") -> NegotiationRe
             for context in request.presentation_context_definition_list
         ]
         lines += [f"  {remark}" for remark in getattr(association.dul.socket, "remarks", ())]
+    calling, peer = str(request.calling_ae_title).strip(), str(association.requestor.address)
+    proposed = request.presentation_context_definition_list
+    lost = [] if why_rejected else _lost_kinds(proposed, accepted, refused)
     return NegotiationReport(
-        calling_ae_title=str(request.calling_ae_title).strip(),
+        calling_ae_title=calling,
         called_ae_title=str(request.called_ae_title).strip(),
-        peer=str(association.requestor.address),
+        peer=peer,
         accepted=not why_rejected,
         lines=tuple(lines),
+        matters=f"{calling!r} ({peer}) cannot send {'; '.join(lost)}" if lost else "",
     )
+
+
+def _lost_kinds(
+    proposed: Sequence[PresentationContext],
+    accepted: Mapping[int, PresentationContext],
+    refused: Mapping[int, PresentationContext],
+) -> list[str]:
+    """Kinds of MR images of which no context was accepted, and why."""
+    kinds: dict[str, list[PresentationContext]] = {}
+    for context in proposed:
+        kinds.setdefault(str(context.abstract_syntax), []).append(context)
+    lost = []
+    for uid, contexts in kinds.items():
+        if uid not in MR_CLASSES or any(c.context_id in accepted for c in contexts):
+            continue
+        names = sorted({UID(s).name for c in contexts for s in c.transfer_syntax})
+        more = f" and {len(names) - _MOST_NAMED} more" if len(names) > _MOST_NAMED else ""
+        answer = refused.get(contexts[0].context_id)
+        why = _RESULTS.get(answer.result if answer else 2, "refused")
+        lost.append(f"{UID(uid).name} in {', '.join(names[:_MOST_NAMED])}{more}: {why}")
+    return lost
 
 
 def _line(

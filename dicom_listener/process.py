@@ -82,6 +82,7 @@ def intake_rules(config: Config) -> IntakeRules:
         slices=SliceRules(
             coronal_tolerance_deg=config.imaging.coronal_tolerance_deg,
             allow_derived=listener.allow_derived,
+            allow_camera=listener.camera_slices,
             distortion_corrected=config.imaging.distortion_corrected,
         ),
         assign=AssignRules(

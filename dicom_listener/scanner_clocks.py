@@ -12,10 +12,14 @@ from dicom_listener.clock import (
     Received,
     ScannerClock,
     observe,
+    wrong_duration,
 )
 from dicom_slice.header import Slice
 
-_COMPARE = "compare the clocks"
+_WHAT_TO_DO = {
+    kind: "; compare the clocks"
+    for kind in ("clock_jump", "late_or_clock_jump", "push_delay_unlike_measured", "clock_drift")
+}
 
 
 class ScannerClocks:
@@ -42,15 +46,18 @@ class ScannerClocks:
         self._clocks[scanner] = seen.clock
         is_new = not before.is_witnessed(self._rules) and seen.clock.is_witnessed(self._rules)
         self._has_news |= is_new
-        drift = self._drifts.get(scanner, Drift()).with_slice(received)
+        drift = self._drifts.get(scanner, Drift())
+        if not seen.duration:
+            drift = drift.with_slice(received)
         self._drifts[scanner] = drift
         alarms = [
             *self._standing_alarm("clock_jump", scanner, seen.jump),
             *self._standing_alarm("late_or_clock_jump", scanner, seen.late),
             *self._standing_alarm("push_delay_unlike_measured", scanner, seen.unlike),
+            *self._standing_alarm("wrong_duration", scanner, seen.duration),
             *self._standing_alarm("clock_drift", scanner, self._drift_text(drift)),
         ]
-        return [(kind, f"{scanner}: {text}; {_COMPARE}") for kind, text in alarms]
+        return [(kind, f"{scanner}: {text}{_WHAT_TO_DO.get(kind, '')}") for kind, text in alarms]
 
     def _clock(self, scanner: str) -> ScannerClock:
         return self._clocks.get(scanner, self._unseen)
@@ -74,6 +81,13 @@ class ScannerClocks:
         if received is None:
             return OffsetUnknown("the header has no acquisition time")
         return self._clock(slice_.scanner).bounds_for(received, self._rules)
+
+    def wrong_duration(self, slice_: Slice, received_s: float) -> str:
+        """Why the end of its acquisition cannot be true; empty where nothing says so."""
+        received = _received(slice_, received_s)
+        if received is None:
+            return ""
+        return wrong_duration(received, self.offset(slice_, received_s), self._rules)
 
     def heed(self, kind: str, body: Mapping[str, Any], wall_s: float) -> None:
         """Follow an event of the record, where it concerns clocks."""

@@ -239,9 +239,9 @@ class Scp:
         self._metrics.associations.labels("accepted").inc()
         self.reports.append(report)
         text = str(report).replace("\n", "; ")
-        if report.anything_refused:
-            self._say("contexts_refused", text)
-        elif self._is_news("association", text):
+        if report.matters:
+            self._say("contexts_refused", report.matters)
+        if self._is_news("association", text):
             log.info("association", text=text)
         event.assoc.dul.socket.message_done()
 

@@ -14,7 +14,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from dicom_slice.header import Slice, read_header
-from dicom_slice.pixels import check_pixels
+from dicom_slice.pixels import check_pixels, frame_digests
 from dicom_slice.reasons import Reason, UnusableError
 
 _MOST_MEMORY_BYTES = 2 * 2**30
@@ -38,7 +38,7 @@ class DecodeGuard:
         """As `pixels.check_pixels`: what is wrong with the pixels, by frame index."""
         if all(slice_.transfer_syntax_uid in _UNCOMPRESSED for slice_ in slices):
             return check_pixels(path, slices)
-        answer = self._ask(path)
+        answer = self._ask(str(path))
         if answer is None:
             crashed = UnusableError(Reason.UNDECODABLE, "the decoder crashed on the pixels")
             return {slice_.frame: crashed for slice_ in slices}
@@ -47,6 +47,15 @@ class DecodeGuard:
         return {
             int(frame): UnusableError(Reason(code), text) for frame, (code, text) in answer.items()
         }
+
+    def digests(self, path: Path) -> dict[int, str]:
+        """As `pixels.frame_digests`, always in the child: who asks knows nothing of the file."""
+        answer = self._ask([str(path)])
+        if answer is None:
+            raise UnusableError(Reason.UNDECODABLE, "the decoder crashed on the pixels")
+        if "all" in answer:
+            raise UnusableError(Reason(answer["all"][0]), answer["all"][1])
+        return {int(frame): digest for frame, (digest,) in answer.items()}
 
     def close(self) -> None:
         if self._child is None:
@@ -58,13 +67,13 @@ class DecodeGuard:
                 stream.close()
         self._child = None
 
-    def _ask(self, path: Path) -> dict[str, list[str]] | None:
+    def _ask(self, question: str | list[str]) -> dict[str, list[str]] | None:
         """The child's answer; None where it died over the question or did not answer in time."""
         child = self._running()
         assert child.stdin is not None
         assert child.stdout is not None
         try:
-            child.stdin.write(json.dumps(str(path)).encode() + b"\n")
+            child.stdin.write(json.dumps(question).encode() + b"\n")
             child.stdin.flush()
             with selectors.DefaultSelector() as selector:
                 selector.register(child.stdout, selectors.EVENT_READ)
@@ -92,8 +101,12 @@ class DecodeGuard:
         return self._child
 
 
-def _answer(path: Path) -> dict[str, list[str]]:
+def _answer(question: str | list[str]) -> dict[str, list[str]]:
+    """Of a path: what is wrong with its pixels; of a list with a path: digests of its frames."""
     try:
+        if isinstance(question, list):
+            return {str(frame): [d] for frame, d in frame_digests(Path(question[0])).items()}
+        path = Path(question)
         problems = check_pixels(path, read_header(path))
     except UnusableError as error:
         return {"all": [error.reason.code, error.reason.text]}
@@ -101,13 +114,13 @@ def _answer(path: Path) -> dict[str, list[str]]:
 
 
 def main() -> None:
-    """The child: one path a line on standard input, one JSON object a line on standard output."""
+    """The child: a question a line on standard input, one JSON object a line on standard output."""
     # a picture may say that it is larger than all the memory there is
     resource.setrlimit(resource.RLIMIT_AS, (_MOST_MEMORY_BYTES, _MOST_MEMORY_BYTES))
     answers = os.fdopen(os.dup(1), "wb", buffering=0)
     os.dup2(2, 1)  # codecs print; their words must not be taken for answers
     for line in sys.stdin.buffer:
-        answers.write(json.dumps(_answer(Path(json.loads(line)))).encode() + b"\n")
+        answers.write(json.dumps(_answer(json.loads(line))).encode() + b"\n")
 
 
 if __name__ == "__main__":

@@ -70,9 +70,8 @@ class Elements:
         value = self.raw(key)
         if value is None:
             return ()
-        values = [value] if isinstance(value, str) or not hasattr(value, "__iter__") else value
         try:
-            numbers = tuple(float(v) for v in values)
+            numbers = plain_numbers(value)
         except (TypeError, ValueError):
             self.warnings.append(f"{_name(key)} is not a number: {str(value)[:32]!r}")
             return ()
@@ -80,6 +79,11 @@ class Elements:
             self.warnings.append(f"{_name(key)} is not finite")
             return ()
         return numbers
+
+    def shown(self, key: Key) -> str:
+        """The value as it stands there, for people; empty where there is none."""
+        value = self.raw(key)
+        return "" if value is None else "\\".join(self.texts(key))[:48]
 
     def number(self, key: Key) -> float | None:
         numbers = self.numbers(key)
@@ -104,6 +108,28 @@ class Elements:
             return [self._within(item) for item in items]
         except TypeError:
             return []
+
+
+def plain_numbers(value: Any) -> tuple[float, ...]:
+    """The numbers of a DICOM value of any VR that can only mean one thing.
+
+    Text is split at backslashes; a comma stands for the decimal point where no point does (1,5),
+    and between values where each has a point of its own (1.0,1.5). Raises ValueError, TypeError.
+    """
+    parts = value.split("\\") if isinstance(value, str) else value
+    if not hasattr(parts, "__iter__"):
+        parts = [parts]
+    numbers: list[float] = []
+    for part in parts:
+        text = part.strip(" \0") if isinstance(part, str) else ""
+        pieces = text.split(",")
+        if len(pieces) == 2 and "." not in text:
+            numbers.append(float(".".join(pieces)))
+        elif len(pieces) > 1 and all("." in piece for piece in pieces):
+            numbers += map(float, pieces)
+        else:
+            numbers.append(float(part))
+    return tuple(numbers)
 
 
 class FrameElements:

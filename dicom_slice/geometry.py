@@ -124,6 +124,23 @@ class SliceGeometry:
         return directions * np.array(self.spacing_mm)[:, None]
 
 
+def rounded_directions(directions: tuple[float, ...], written: str) -> tuple[float, ...]:
+    """Direction cosines made orthonormal where only their rounding keeps them from it.
+
+    directions: the six numbers of ImageOrientationPatient; written: as text, which shows to how
+    many decimals. What is off by more than rounding explains, or needs nothing, is returned as is.
+    """
+    decimals = max(len(text.partition(".")[2]) for text in written.split("\\"))
+    first, second = np.reshape(directions, (2, 3))
+    skew = max(abs(first @ first - 1), abs(second @ second - 1), abs(first @ second))
+    by_rounding = 2 * np.sqrt(3) * 0.5 * 10.0**-decimals
+    if skew < _DIRECTION_TOLERANCE or decimals < 2 or not skew <= by_rounding:
+        return directions
+    # the nearest orthonormal pair: neither of the two is trusted more than the other
+    left, _, right = np.linalg.svd(np.stack([first, second]), full_matrices=False)
+    return tuple((left @ right).ravel().tolist())
+
+
 def _points(points: ArrayLike, size: int) -> NDArray[np.float64]:
     array = np.asarray(points, dtype=float)
     if array.ndim == 0 or array.shape[-1] != size:

@@ -6,17 +6,20 @@ that we ever use is touched, and what is wrong has a name before the slice goes 
 
 import warnings
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from pydicom import dcmread
+from pydicom.datadict import tag_for_keyword
 from pydicom.dataset import Dataset, FileDataset
 from pydicom.errors import InvalidDicomError
+from pydicom.tag import Tag
 
 from dicom_slice import quirks
 from dicom_slice.bounds import check_bounds
 from dicom_slice.elements import Elements, FrameElements, frame_elements
-from dicom_slice.geometry import SliceGeometry
+from dicom_slice.geometry import SliceGeometry, rounded_directions
 from dicom_slice.patient import Identity, patient_digest
 from dicom_slice.quirks import Kind
 from dicom_slice.reasons import Reason, UnusableError
@@ -192,6 +195,8 @@ def _slices_of(data_set: Dataset, times: TimeFrame, noted: list[str]) -> list[Sl
 def _check_is_mr(sop_class: str, modality: str) -> None:
     if sop_class in quirks.MR_CLASSES or (not sop_class and modality == "MR"):
         return
+    if quirks.is_camera(sop_class, modality):
+        return
     if sop_class.startswith("1.2.840.10008.5.1.4.1.1.7"):
         raise UnusableError(Reason.SCREEN_SAVE, "a secondary capture (screen save), not MR data")
     what = modality or sop_class or "an object without modality"
@@ -216,7 +221,7 @@ def _slice(
         geometry_problem=geometry_problem,
         interval=interval,
         time_problem=time_problem,
-        kind=quirks.kind_of(frame, image_type),
+        kind=_kind(frame, image_type),
         is_mosaic=quirks.is_mosaic(top, image_type),
         is_localizer=quirks.is_localizer(image_type, description),
         distortion_corrected=quirks.is_distortion_corrected(image_type),
@@ -248,6 +253,13 @@ def _slice(
     )
 
 
+def _kind(frame: FrameElements, image_type: tuple[str, ...]) -> Kind:
+    top = frame.top
+    if quirks.is_camera(top.text("SOPClassUID"), top.text("Modality").upper()):
+        return Kind.CAMERA
+    return quirks.kind_of(frame, image_type)
+
+
 def _number(keyword: str) -> Any:
     return lambda item: item.number(keyword)
 
@@ -258,24 +270,38 @@ def _image_type(frame: FrameElements) -> tuple[str, ...]:
     return found or frame.top.texts("ImageType")
 
 
+_PLACES = {
+    "ImagePositionPatient": ("PlanePositionSequence", 3),
+    "ImageOrientationPatient": ("PlaneOrientationSequence", 6),
+    "PixelSpacing": ("PixelMeasuresSequence", 2),
+}
+
+
 def _geometry(frame: FrameElements, shape: tuple[int, int]) -> tuple[SliceGeometry | None, str]:
-    position = frame.find("PlanePositionSequence", lambda i: i.numbers("ImagePositionPatient"))
-    direction = frame.find(
-        "PlaneOrientationSequence", lambda i: i.numbers("ImageOrientationPatient")
-    )
-    spacing = frame.find("PixelMeasuresSequence", lambda i: i.numbers("PixelSpacing"))
-    values = {
-        "ImagePositionPatient": position,
-        "ImageOrientationPatient": direction,
-        "PixelSpacing": spacing,
-    }
+    values, shown = {}, {}
+    for name, (sequence, size) in _PLACES.items():
+        values[name] = frame.find(sequence, partial(Elements.numbers, key=name)) or ()
+        shown[name] = frame.find(sequence, partial(Elements.shown, key=name)) or ""
+        if shown[name] and len(values[name]) != size:
+            return None, _bad_value(name, shown[name], f"should be {size} numbers")
     missing = [name for name, value in values.items() if not value]
     if missing:
         return None, f"no {', '.join(missing)}"
+    position, directions, spacing = values.values()
     try:
-        return SliceGeometry.from_header(position, direction, spacing, shape), ""
+        orthonormal = rounded_directions(directions, shown["ImageOrientationPatient"])
+        if orthonormal != directions:
+            frame.top.warnings.append(
+                f"ImageOrientationPatient is rounded: {shown['ImageOrientationPatient']}"
+            )
+        return SliceGeometry.from_header(position, orthonormal, spacing, shape), ""
     except ValueError as error:
-        return None, str(error)
+        return None, f"{error} ({', '.join(f'{k} {v}' for k, v in shown.items())})"
+
+
+def _bad_value(name: str, shown: str, what: str) -> str:
+    tag = Tag(tag_for_keyword(name) or 0)
+    return f"{name} ({tag.group:04X},{tag.element:04X}) {what}, is {shown!r}"
 
 
 def _interval(frame: FrameElements, times: TimeFrame) -> tuple[AcquisitionInterval | None, str]:

@@ -1,5 +1,6 @@
 """The pixels of one frame as physical magnitudes."""
 
+import hashlib
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
@@ -51,6 +52,18 @@ def frame_pixels(data_set: FileDataset, frame: int) -> NDArray[np.float64]:
     if not np.isfinite(values).all():
         raise UnusableError(Reason.UNDECODABLE, "the rescaled pixels are not finite")
     return values
+
+
+def frame_digests(path: Path) -> dict[int, str]:
+    """SHA-256 of the magnitudes of every frame: equal in every lossless encoding of an image."""
+    data_set = read_with_pixels(path)
+    number = Elements(data_set).integer("NumberOfFrames") or 1
+    digests = {}
+    for frame in range(number):
+        pixels = frame_pixels(data_set, frame)
+        shape = str(pixels.shape).encode()
+        digests[frame] = hashlib.sha256(shape + pixels.tobytes()).hexdigest()
+    return digests
 
 
 def _stored(data_set: FileDataset, top: Elements, frame: int) -> NDArray[np.integer]:

@@ -10,6 +10,7 @@ from dicom_slice.elements import Elements, FrameElements
 MR_IMAGE = "1.2.840.10008.5.1.4.1.1.4"
 ENHANCED_MR_IMAGE = "1.2.840.10008.5.1.4.1.1.4.1"
 LEGACY_ENHANCED_MR_IMAGE = "1.2.840.10008.5.1.4.1.1.4.4"
+SECONDARY_CAPTURE = "1.2.840.10008.5.1.4.1.1.7"
 MR_CLASSES = (MR_IMAGE, ENHANCED_MR_IMAGE, LEGACY_ENHANCED_MR_IMAGE)
 
 _GE_IMAGE_TYPE = (0x0043, 0x102F)
@@ -37,6 +38,9 @@ _OTHER_MAPS = {"B0", "B0 MAP", "B1", "FIELD_MAP", "FIELDMAP", "FREQUENCY MAP", "
 _LOCALIZER_TITLES = ("localizer", "localiser", "locator", "scout", "survey", "3-plane", "3 plane")
 
 
+_UNITS_APART = 30.0  # an estimate may be that far off, and seconds are still told from ms
+
+
 class Kind(StrEnum):
     """What the pixels of a frame are."""
 
@@ -45,6 +49,12 @@ class Kind(StrEnum):
     REAL = "real"
     IMAGINARY = "imaginary"
     OTHER = "other"
+    CAMERA = "camera"
+
+
+def is_camera(sop_class: str, modality: str) -> bool:
+    """A slice of the bench: a secondary capture that an external camera took (`bench`)."""
+    return sop_class == SECONDARY_CAPTURE and modality == "XC"
 
 
 def kind_of(frame: FrameElements, image_type: tuple[str, ...]) -> Kind:
@@ -93,6 +103,28 @@ def ge_duration_s(top: Elements) -> float | None:
         return None
     duration_us = top.number(_GE_DURATION)
     return duration_us / 1e6 if duration_us and duration_us > 0 else None
+
+
+def whole_duration_s(top: Elements, estimated_s: float | None) -> float | None:
+    """AcquisitionDuration, in seconds by the standard; UIH writes milliseconds.
+
+    Beside what the sequence itself takes (estimated_s), a value of some other vendor that is a
+    thousand times too long is in milliseconds, too, and one of UIH that fits as it is in seconds.
+    """
+    value = top.number("AcquisitionDuration")
+    if value is None or not value > 0:
+        return None
+    in_ms = top.text("Manufacturer").upper().startswith("UIH")
+    if estimated_s:
+        fits_as_s, fits_as_ms = (
+            1 / _UNITS_APART < v / estimated_s < _UNITS_APART for v in (value, value / 1000)
+        )
+        if fits_as_s != fits_as_ms:
+            in_ms = fits_as_ms
+    if not in_ms:
+        return value
+    top.warnings.append(f"AcquisitionDuration {value:g} was taken as milliseconds")
+    return value / 1000
 
 
 def is_mosaic(top: Elements, image_type: tuple[str, ...]) -> bool:

@@ -47,6 +47,7 @@ class Reason(StrEnum):
     NOT_CONFIRMED = "not_confirmed"
     # The identity
     UID_CONFLICT = "same_uid_other_bytes"
+    REENCODED_COPY = "same_slice_other_encoding"
     OTHER_PATIENT = "other_patient"
     OTHER_STUDY = "other_study"
     OTHER_FRAME = "other_frame_of_reference"

@@ -5,15 +5,17 @@ AcquisitionDate with AcquisitionTime. Content, series, instance creation and tri
 never looked at. The interval is never made shorter than what the header can prove.
 """
 
-from collections.abc import Iterator
+import re
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from datetime import datetime, timedelta, timezone, tzinfo
 
 from dicom_slice.elements import Elements, FrameElements
-from dicom_slice.quirks import ge_duration_s
+from dicom_slice.quirks import ge_duration_s, whole_duration_s
 
 _EARLIEST_YEAR = 1990  # de-identified headers say 0001 or 1900
 _DAY = timedelta(days=1)
+_MOST_HOURS = 14
 
 
 @dataclass(frozen=True)
@@ -50,31 +52,64 @@ class ImplausibleTimeError(ValueError):
 def acquisition_interval(frame: FrameElements, times: TimeFrame) -> AcquisitionInterval | None:
     """Return the interval of one frame, or None where the header has no acquisition time at all.
 
-    Raises ImplausibleTimeError (year 0001, 25 o'clock, a local time that does not exist...).
+    An instant that cannot be read does not hide one that can; it is named in the warnings. Where
+    none can, raises ImplausibleTimeError (year 0001, 25 o'clock, a local time that does not exist).
     """
     duration_s, estimated = _duration_s(frame)
-    reference, acquisition = _frame_instants(frame, times)
+    found = _Instants(frame, times)
+    reference = found.of_frame("FrameReferenceDateTime")
+    acquisition = found.of_frame("FrameAcquisitionDateTime")
     if reference is not None:
-        return _around(reference, acquisition, duration_s, estimated)
+        return found.told(_around(reference, acquisition, duration_s, estimated))
     if acquisition is not None:
-        return _from(acquisition, duration_s, "FrameAcquisitionDateTime", estimated)
-    text = frame.top.text("AcquisitionDateTime")
-    if text:
-        start_s = _instant(text, frame.top, times)
-        return _from(start_s, duration_s, "AcquisitionDateTime", estimated)
-    time_text = frame.top.text("AcquisitionTime")
-    if not time_text:
-        return None
-    start_s = _date_and_time(frame.top.text("AcquisitionDate"), time_text, frame.top, times)
-    return _from(start_s, duration_s, "AcquisitionDate+AcquisitionTime", estimated)
+        return found.told(_from(acquisition, duration_s, "FrameAcquisitionDateTime", estimated))
+    start_s = found.read("AcquisitionDateTime", frame.top.text("AcquisitionDateTime"))
+    if start_s is not None:
+        return found.told(_from(start_s, duration_s, "AcquisitionDateTime", estimated))
+    start_s = found.date_and_time()
+    if start_s is not None:
+        return found.told(_from(start_s, duration_s, "AcquisitionDate+AcquisitionTime", estimated))
+    if found.problems:
+        raise ImplausibleTimeError("; ".join(found.problems))
+    return None
 
 
-def _frame_instants(frame: FrameElements, times: TimeFrame) -> tuple[float | None, float | None]:
-    def instant(keyword: str) -> float | None:
-        text = frame.find("FrameContentSequence", lambda item: item.text(keyword))
-        return _instant(text, frame.top, times) if text else None
+class _Instants:
+    """The instants of one header, each read for itself; what is wrong with one is kept in words."""
 
-    return instant("FrameReferenceDateTime"), instant("FrameAcquisitionDateTime")
+    def __init__(self, frame: FrameElements, times: TimeFrame) -> None:
+        self._frame, self._times = frame, times
+        self.problems: list[str] = []
+
+    def read(self, name: str, text: str) -> float | None:
+        if not text:
+            return None
+        return self._tried(name, lambda: _instant(text, self._frame.top, self._times))
+
+    def of_frame(self, name: str) -> float | None:
+        text = self._frame.find("FrameContentSequence", lambda item: item.text(name))
+        return self.read(name, text or "")
+
+    def date_and_time(self) -> float | None:
+        top = self._frame.top
+        date, time = top.text("AcquisitionDate"), top.text("AcquisitionTime")
+        if not time:
+            return None
+        return self._tried(
+            "AcquisitionDate, AcquisitionTime", lambda: _date_and_time(date, time, top, self._times)
+        )
+
+    def told(self, interval: AcquisitionInterval) -> AcquisitionInterval:
+        """The interval, after a warning of everything that was not used for it."""
+        self._frame.top.warnings.extend(f"not used: {problem}" for problem in self.problems)
+        return interval
+
+    def _tried(self, name: str, read: Callable[[], float]) -> float | None:
+        try:
+            return read()
+        except ImplausibleTimeError as error:
+            self.problems.append(f"{name}: {error}")
+            return None
 
 
 def _from(
@@ -104,15 +139,16 @@ def _duration_s(frame: FrameElements) -> tuple[float | None, bool]:
     frame_ms = frame.find(
         "FrameContentSequence", lambda item: item.number("FrameAcquisitionDuration")
     )
-    whole_s = frame.top.number("AcquisitionDuration")
     if frame_ms is not None and frame_ms > 0:
         return frame_ms / 1000, False
-    if whole_s is not None and whole_s > 0:
+    estimated_s = _estimated_duration_s(frame)
+    whole_s = whole_duration_s(frame.top, estimated_s)
+    if whole_s is not None:
         return whole_s, False
     ge_s = ge_duration_s(frame.top)
     if ge_s is not None:
         return ge_s, False
-    return _estimated_duration_s(frame), True
+    return estimated_s, True
 
 
 def _estimated_duration_s(frame: FrameElements) -> float | None:
@@ -133,62 +169,88 @@ def _estimated_duration_s(frame: FrameElements) -> float | None:
     return repetition_ms / 1000 * steps * max(averages or 1.0, 1.0) if steps else None
 
 
+_ISO = re.compile(r"(\d{4})-(\d{2})-(\d{2})[T ](\d{2}):(\d{2}):(\d{2}(?:[.,]\d+)?)(.*)")
+_ZONE = re.compile(r"([+-]?)(\d{2}):?(\d{2})")
+
+
 def _instant(text: str, top: Elements, times: TimeFrame) -> float:
-    """A DICOM DT value: YYYYMMDDHHMMSS.FFFFFF&ZZXX."""
-    body, sign, offset = text, "", ""
+    """A DICOM DT value, YYYYMMDDHHMMSS.FFFFFF&ZZXX; also as ISO 8601 writes it."""
+    iso = _ISO.fullmatch(text)
+    plain = "".join(iso.groups()).replace("Z", "+0000") if iso else text
+    body, sign, offset = plain, "", ""
     for mark in "+-":
-        if mark in text:
-            body, _, offset = text.partition(mark)
+        if mark in plain:
+            body, _, offset = plain.partition(mark)
             sign = mark
     body = body.strip()
-    if len(body.partition(".")[0]) < 14:
+    if len(re.split("[.,]", body)[0]) < 14:
         raise ImplausibleTimeError(f"{text!r} does not give date and time to the second")
-    zone = _offset_zone(sign + offset, text) if sign else _header_zone(top)
-    return _epoch_s(_local(body[:8], body[8:]), zone, times)
+    local = _local(body[:8], body[8:])
+    zone = _offset_zone(sign + offset, local, times) if sign else _header_zone(top, local, times)
+    return _epoch_s(local, zone, times)
 
 
 def _date_and_time(date: str, time: str, top: Elements, times: TimeFrame) -> float:
-    zone = _header_zone(top)
     if date:
-        return _epoch_s(_local(date.replace(".", ""), time), zone, times)
+        local = _local(date.replace(".", "").replace("-", ""), time)
+        return _epoch_s(local, _header_zone(top, local, times), times)
     if times.received_s is None:
         raise ImplausibleTimeError("AcquisitionTime without AcquisitionDate")
-    received = datetime.fromtimestamp(times.received_s, zone or times.zone)
-    candidates = [
-        _epoch_s(_local(f"{received + shift * _DAY:%Y%m%d}", time), zone, times)
-        for shift in (-1, 0, 1)
-    ]
+    received = datetime.fromtimestamp(times.received_s, times.zone)
+    candidates, problem = [], None
+    for shift in (-1, 0, 1):
+        try:
+            local = _local(f"{received + shift * _DAY:%Y%m%d}", time)
+            candidates.append(_epoch_s(local, _header_zone(top, local, times), times))
+        except ImplausibleTimeError as error:  # a clock skips an hour in spring, on one day of them
+            problem = error
+    if not candidates:
+        raise problem or ImplausibleTimeError(f"{time!r} is no time")
     # The scanner's clock may run ahead of ours by a little, hardly by half a day.
     return min(candidates, key=lambda s: abs(s - times.received_s))  # type: ignore[operator]
 
 
 def _local(date: str, time: str) -> datetime:
     """Naive local time from DA and TM; TM may end after the hours, and may have colons (ACR)."""
-    digits, _, fraction = time.replace(":", "").partition(".")
+    digits, _, fraction = time.replace(":", "").replace(",", ".").partition(".")
+    shown = f"{date!r} {time!r} is not a date and time"
+    if not (digits.isdecimal() and (not fraction or fraction.isdecimal())):
+        raise ImplausibleTimeError(shown)
     digits = digits.ljust(6, "0")
     if digits[4:6] == "60":  # a leap second
         digits = digits[:4] + "59"
     try:
         moment = datetime.strptime(date + digits[:6], "%Y%m%d%H%M%S")
-        micros = int((fraction or "0")[:6].ljust(6, "0"))
     except ValueError:
-        raise ImplausibleTimeError(f"{date!r} {time!r} is not a date and time") from None
+        raise ImplausibleTimeError(shown) from None
     if moment.year < _EARLIEST_YEAR:
         raise ImplausibleTimeError(f"the year is {moment.year:04d}")
-    return moment.replace(microsecond=micros)
+    return moment.replace(microsecond=int((fraction or "0")[:6].ljust(6, "0")))
 
 
-def _header_zone(top: Elements) -> tzinfo | None:
+def _header_zone(top: Elements, local: datetime, times: TimeFrame) -> tzinfo | None:
     text = top.text("TimezoneOffsetFromUTC")
-    return _offset_zone(text, text) if text else None
-
-
-def _offset_zone(text: str, shown: str) -> tzinfo:
+    if not text:
+        return None
     try:
-        minutes = int(text[1:3]) * 60 + int(text[3:5])
-        return timezone(timedelta(minutes=-minutes if text[0] == "-" else minutes))
-    except (ValueError, IndexError):
-        raise ImplausibleTimeError(f"{shown!r} has no readable offset from UTC") from None
+        return _offset_zone(text, local, times)
+    except ImplausibleTimeError as error:
+        raise ImplausibleTimeError(f"TimezoneOffsetFromUTC (0008,0201): {error}") from None
+
+
+def _offset_zone(text: str, local: datetime, times: TimeFrame) -> tzinfo:
+    """The zone of an offset; one without a sign is read if the scanner's own zone has it."""
+    found = _ZONE.fullmatch(text.strip())
+    if not found or not int(found[2]) <= _MOST_HOURS or not int(found[3]) < 60:
+        raise ImplausibleTimeError(f"{text!r} is no offset from UTC")
+    offset = timedelta(hours=int(found[2]), minutes=int(found[3]))
+    if found[1] or not offset:
+        return timezone(-offset if found[1] == "-" else offset)
+    there = local.replace(tzinfo=times.zone) if times.zone else local.astimezone()
+    for signed in (offset, -offset):
+        if there.utcoffset() == signed:
+            return timezone(signed)
+    raise ImplausibleTimeError(f"{text!r} has no sign, and is not the offset of the room's zone")
 
 
 def _epoch_s(local: datetime, zone: tzinfo | None, times: TimeFrame) -> float:

@@ -26,6 +26,7 @@ class SliceRules:
     allow_real: bool = False
     allow_derived: bool = False
     allow_localizer: bool = False
+    allow_camera: bool = False
     need_geometry: bool = True
     distortion_corrected: bool | None = None
     most_pixels: int | None = 2048**2
@@ -37,6 +38,7 @@ BY_HAND = SliceRules(
     allow_real=True,
     allow_derived=True,
     allow_localizer=True,
+    allow_camera=True,
     need_geometry=False,
     most_pixels=None,
 )
@@ -62,6 +64,11 @@ def _wrong_pixels(slice_: Slice, rules: SliceRules) -> SetAside | None:
 
 def _wrong_kind(slice_: Slice, rules: SliceRules) -> SetAside | None:
     image_type = "\\".join(slice_.image_type)
+    if slice_.kind is Kind.CAMERA:
+        if rules.allow_camera:
+            return None
+        text = "a camera's picture; [listener] camera_slices = true lets them count"
+        return SetAside(Reason.NOT_MR, text)
     if slice_.is_mosaic:
         return SetAside(Reason.MOSAIC, f"a mosaic of several slices ({image_type})")
     if any(value.upper() == "SCREEN SAVE" for value in slice_.image_type):

@@ -102,6 +102,9 @@ class ListenerConfig(Section):
         "acquisition, and every result is marked.",
     )
     allow_derived: bool = Field(default=False, description="True: use derived images too.")
+    camera_slices: bool = Field(
+        default=False, description="True: slices of a bench camera (`autospine camera`) count too."
+    )
     metrics_port: int | None = Field(
         default=None, ge=0, le=65535, description="Serve /metrics on localhost; absent: do not."
     )

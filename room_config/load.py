@@ -36,7 +36,7 @@ class ConfigError(Exception):
 
 
 class Config(BaseModel):
-    """The whole file. `[bridge]` and `[virtual]` are checked by those who own them."""
+    """The whole file. `[bridge]`, `[virtual]` and `[camera]` are checked by those who own them."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -49,6 +49,7 @@ class Config(BaseModel):
     openigtlink: OpenIgtLinkConfig = Field(default_factory=OpenIgtLinkConfig)
     bridge: dict[str, Any] = Field(default_factory=dict)
     virtual: dict[str, Any] = Field(default_factory=dict)
+    camera: dict[str, Any] = Field(default_factory=dict)
 
 
 def load_config(path: Path, environment: Mapping[str, str] = os.environ) -> Config:

@@ -15,6 +15,7 @@ from room_config.exit_codes import BAD_INPUT
 from room_config.load import ConfigError, read_toml
 from simulator.config import VirtualRoom, VirtualRoomError, parse_virtual_room
 from simulator.scan_operator import operate, read_token
+from simulator.scanner import Note
 
 app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 
@@ -33,10 +34,10 @@ def scanner(
     try:
         room = _virtual_room(config)
         assert room.scanner is not None
-        stop = _stop_event(exit_with_parent)
+        stop = stop_event(exit_with_parent)
         ready = {"ready": "scanner", "truth_file": room.scanner.truth_file}
         token = read_token(room.scanner, os.environ)
-        operate(room, stop, _note, lambda: print(json.dumps(ready), flush=True), token)
+        operate(room, stop, note_as("scanner"), lambda: print(json.dumps(ready), flush=True), token)
     except (ConfigError, VirtualRoomError) as error:
         print(error, file=sys.stderr)
         raise typer.Exit(BAD_INPUT) from None
@@ -59,7 +60,7 @@ def _virtual_room(path: Path) -> VirtualRoom:
     return room.model_copy(update={"scanner": scanner})
 
 
-def _stop_event(exit_with_parent: bool) -> threading.Event:
+def stop_event(exit_with_parent: bool) -> threading.Event:
     """Set by SIGINT, SIGTERM and, if wanted, the end of standard input."""
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
@@ -77,8 +78,14 @@ def _stop_at_end_of_input(stop: threading.Event) -> None:
     stop.set()
 
 
-def _note(line: str) -> None:
-    print(json.dumps({"process": "scanner", "note": line}), file=sys.stderr, flush=True)
+def note_as(process: str) -> Note:
+    """Writes one JSON object a line to standard error, under the name of the process."""
+
+    def note(line: str) -> None:
+        if line:
+            print(json.dumps({"process": process, "note": line}), file=sys.stderr, flush=True)
+
+    return note
 
 
 if __name__ == "__main__":

@@ -8,9 +8,10 @@ scanner from scanning.
 import heapq
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from types import TracebackType
+from typing import Protocol
 
 from pydicom.dataset import Dataset
 from pydicom.uid import ExplicitVRLittleEndian, ImplicitVRLittleEndian
@@ -19,7 +20,6 @@ from pynetdicom.association import Association
 from pynetdicom.sop_class import EnhancedMRImageStorage, MRImageStorage
 
 from dicom_listener.requestor import mended
-from simulator.config import ScannerSettings
 
 _TRANSFER_SYNTAXES = [ExplicitVRLittleEndian, ImplicitVRLittleEndian]
 
@@ -45,11 +45,39 @@ class Delivery:
     reason: str
 
 
+class Route(Protocol):
+    """From whom to whom, and how often it is tried."""
+
+    @property
+    def ae_title(self) -> str: ...
+
+    @property
+    def listener_host(self) -> str: ...
+
+    @property
+    def listener_port(self) -> int: ...
+
+    @property
+    def listener_ae_title(self) -> str: ...
+
+    @property
+    def retry_s(self) -> float: ...
+
+    @property
+    def retries(self) -> int: ...
+
+
 class Outbox:
     """Owns the sending thread. `report` is called from it, once for each push that has ended."""
 
-    def __init__(self, settings: ScannerSettings, report: Callable[[Delivery], None]) -> None:
+    def __init__(
+        self,
+        settings: Route,
+        report: Callable[[Delivery], None],
+        sop_classes: Sequence[str] = (MRImageStorage, EnhancedMRImageStorage),
+    ) -> None:
         self._settings = settings
+        self._sop_classes = sop_classes
         self._report = report
         self._waiting: list[Push] = []
         self._resume_s = 0.0  # nothing is sent before (time.monotonic)
@@ -107,7 +135,7 @@ class Outbox:
 
     def _send(self, batch: list[Push]) -> list[Push]:
         """Send in one association; the pushes that are to be tried again."""
-        association = _associate(self._settings)
+        association = _associate(self._settings, self._sop_classes)
         again = []
         for push in batch:
             status, reason = _store(association, push)
@@ -137,10 +165,10 @@ def _is_final(status: int | None) -> bool:
     return status is not None and (status & 0xFF00 == 0xA900 or status & 0xF000 == 0xC000)
 
 
-def _associate(settings: ScannerSettings) -> Association:
+def _associate(settings: Route, sop_classes: Sequence[str]) -> Association:
     entity = AE(ae_title=settings.ae_title)
     entity.acse_timeout = entity.dimse_timeout = entity.network_timeout = 10
-    for sop_class in (MRImageStorage, EnhancedMRImageStorage):
+    for sop_class in sop_classes:
         entity.add_requested_context(sop_class, _TRANSFER_SYNTAXES)
     return mended(
         entity.associate(

@@ -74,7 +74,7 @@ def operate(
     settings = room.scanner
     with contextlib.closing(TruthFile(Path(settings.truth_file))) as truth:
         report = _reporter(truth, note)
-        say = _once_in_a_row(note)
+        say = say_once_in_a_row(note)
         headers = {"Authorization": f"Bearer {token}"} if token else {}
         with (
             httpx.Client(timeout=2.0, trust_env=False, headers=headers) as http,
@@ -116,7 +116,7 @@ def _reporter(truth: TruthFile, note: Note) -> Callable[[Delivery], None]:
     return report
 
 
-def _once_in_a_row(note: Note) -> Note:
+def say_once_in_a_row(note: Note) -> Note:
     """The same line is said once, until something else has been said; '' says nothing."""
     last = ""
 

@@ -85,3 +85,15 @@ class OutsideGateError(EngineError):
     """The object found is not where, or not as large as, it was predicted to be."""
 
     reason = "outside-gate"
+
+
+class TemplateError(EngineError):
+    """The frames do not make a template: too few, wrongly displaced, or not of one object."""
+
+    reason = "template"
+
+
+class TemplateMismatchError(EngineError):
+    """A frame that does not show what the template shows: another object, or a changed one."""
+
+    reason = "template-mismatch"

@@ -112,16 +112,16 @@ def prior_precision(parameters: Array, model: ObjectModel) -> Array:
     precision = np.zeros(model.n_parameters)
     scales = BACKGROUND_SCALES[0] * abs(float(parameters[AMPLITUDE])) / level, BACKGROUND_SCALES[1]
     background = parameters[[BACKGROUND]] / level
-    precision[BACKGROUND] = _mixture_precision(background, scales) / level**2
-    precision[SLOPES] = _mixture_precision(parameters[SLOPES] / level, SLOPE_SCALES) / level**2
-    precision[SHADING] = _mixture_precision(parameters[SHADING], SHADING_SCALES)
+    precision[BACKGROUND] = mixture_precision(background, scales) / level**2
+    precision[SLOPES] = mixture_precision(parameters[SLOPES] / level, SLOPE_SCALES) / level**2
+    precision[SHADING] = mixture_precision(parameters[SHADING], SHADING_SCALES)
     if model.wall_px is not None:
         precision[WALL] = 1 / (_WALL_SCALE * level) ** 2
         precision[WALL_PX] = 1 / (_WALL_SPREAD * model.wall_px) ** 2
     return precision
 
 
-def _mixture_precision(values: Array, scales: tuple[float, float]) -> float:
+def mixture_precision(values: Array, scales: tuple[float, float]) -> float:
     """Of values (n,) that are all from the narrow or all from the wide component."""
     narrow, wide = 1 / max(scales[0], 1e-12) ** 2, 1 / scales[1] ** 2
     likelihood = 0.5 * float(values @ values) * (narrow - wide)

@@ -34,10 +34,13 @@ from robot_bridge.pmd.status import ERRORS, Status
 
 # The controller's state settles some milliseconds after a command (25 ms in public drivers).
 SETTLE_S = 0.025
-STALL_WINDOW_S = 0.5
+# An encoder that shows no progress: far from the setpoint, where the motor runs fast, it is missed
+# at once; near it the controller may well take its time.
+STALL_WINDOW_S, FAR_WINDOW_S = 0.5, 0.15
+FAR_TOLERANCES, LOOKS_MIN = 10, 4
 RUNAWAY_MARGIN_UM = 100.0
-# Before its first long way an encoder has to follow a short run in open loop.
-PROOF_UM, PROOF_FROM_UM = 200.0, 400.0
+# Before its first way an encoder has to follow a short run in open loop.
+PROOF_UM = 200.0
 # Of the way that the steps should make: load and frequency change a step by a quarter, and a wrong
 # scale is most often one of two.
 FOLLOWS = 0.6
@@ -128,22 +131,28 @@ class PmdAxis(PmdController):
             raise self.error("refused", str(error)) from error
 
     def _prove(self, setpoint_um: int) -> Steps[None]:
-        """The encoder has to follow the motor once, before it is believed over a long way."""
-        distance_um = setpoint_um - self.position_um
-        if self.proven or not self.closed_loop or abs(distance_um) < PROOF_FROM_UM:
+        """The encoder has to follow the motor once over a short way, before it is believed."""
+        if self.proven or not self.closed_loop:
             return
         if (yield from self._microstep_phase()) is None:
             return  # nothing would tell how far the motor went, so the encoder cannot be blamed
         from_um = self.position_um
-        run_um = PROOF_UM if distance_um > 0 else -PROOF_UM
-        yield from self.run_open_loop(pmd_units.microsteps_from_um(self.config, run_um))
-        yield from self.read_position_surely()
-        self.at_rest_um = self.position_um
-        moved_um = self.position_um - from_um
-        if abs(run_um) > 4 * self.jitter_um and not agrees(moved_um, run_um):
-            self.certain = False
-            raise self.error("encoder_disagrees", disagreement(moved_um, run_um))
-        self.proven = True
+        towards = 1 if setpoint_um > from_um else -1
+        end_um = self.config.travel_max_um if towards > 0 else self.config.travel_min_um
+        if abs(end_um - from_um) < 2 * PROOF_UM:
+            towards = -towards
+        run_um = towards * PROOF_UM
+        try:
+            yield from self.run_open_loop(pmd_units.microsteps_from_um(self.config, run_um))
+            yield from self.read_position_surely()
+            self.at_rest_um = self.position_um
+            moved_um = self.position_um - from_um
+            if abs(run_um) > 4 * self.jitter_um and not agrees(moved_um, run_um):
+                raise self.error("encoder_disagrees", disagreement(moved_um, run_um))
+            self.proven = True
+        finally:
+            if not self.proven:  # refuted, or stopped before it was known
+                self.certain = False
 
     def _check_moving(self) -> Steps[None]:
         """The limit bit tells of the last motion, so it is only looked at while ours lasts."""
@@ -349,17 +358,22 @@ class _ProgressWatch:
         self._axis = axis
         self._best_um = distance_um
         self._best_s = now_s
+        self._looks = 0
         self._bound_um = distance_um + RUNAWAY_MARGIN_UM
         count_um = pmd_units.um_per_count(axis.config)
         slowest_um_s = MIN_SPEED_HZ * axis.config.step_um_forward
-        self._window_s = STALL_WINDOW_S + 3 * count_um / slowest_um_s
+        self._resolution_s = 3 * count_um / slowest_um_s
+        self._far_um = FAR_TOLERANCES * axis.config.tolerance_um
 
     def check(self, error_um: float, now_s: float) -> None:
         """Raises AxisFaultError."""
+        self._looks += 1
         if error_um < self._best_um:
-            self._best_um, self._best_s = error_um, now_s
+            self._best_um, self._best_s, self._looks = error_um, now_s, 0
         if error_um > self._bound_um:
             raise self._axis.error("runaway", f"moves away, {error_um:.0f} um from the setpoint")
-        if now_s - self._best_s > self._window_s:
+        far = error_um > self._far_um and self._looks >= LOOKS_MIN
+        window_s = (FAR_WINDOW_S if far else STALL_WINDOW_S) + self._resolution_s
+        if now_s - self._best_s > window_s:
             self._axis.certain = False
             raise self._axis.error("stalled", f"stands {error_um:.0f} um from the setpoint")

@@ -27,7 +27,7 @@ from robot_bridge.pmd.encoder_script import EncoderFound, find_encoder
 from robot_bridge.pmd.homing import home
 from robot_bridge.pmd.line import PmdLine, Procedure, Task
 from robot_bridge.pmd.ports import OpenPort, PmdPorts, SerialPort
-from robot_bridge.pmd.protocol import PmdEchoError, PmdError
+from robot_bridge.pmd.protocol import PmdEchoError, PmdError, PmdTimeoutError
 from robot_bridge.pmd.stop import confirm_stops
 
 log = logging.getLogger(__name__)
@@ -281,6 +281,8 @@ class PmdMotors:
         for name, task in list(tasks.items()):
             if task.done and task.error is not None:
                 failed = self._note_error(self._axes[name], task.error)
+                if tasks is self._motion and isinstance(task.error, PmdTimeoutError):
+                    self._axes[name].certain = False  # nobody saw where it stopped
             if task.done and tasks is self._other:
                 del tasks[name]
         return failed

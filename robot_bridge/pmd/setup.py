@@ -59,14 +59,18 @@ def verify(c: PmdController) -> Steps[None]:
     """Before a move: the board still has the settings that it was given. Raises PmdError."""
     if not c.settings:
         return
-    now = yield from _read_all(c)
-    for number, value in (now or {}).items():
-        if number in c.settings and c.settings[number] != value:
-            c.needs_setup = True
-            c.certain = False
-            raise c.error(
-                "setting", f"Y{number} reads {value}, not {c.settings[number]} as it was set"
-            )
+    differing = yield from _differing(c)
+    if differing:
+        differing = yield from _differing(c)  # it may have been the line
+    for number, value in differing.items():
+        c.needs_setup = True
+        c.certain = False
+        raise c.error("setting", f"Y{number} reads {value}, not {c.settings[number]} as it was set")
+
+
+def _differing(c: PmdController) -> Steps[dict[int, int]]:
+    now = (yield from _read_all(c)) or {}
+    return {n: value for n, value in now.items() if c.settings.get(n, value) != value}
 
 
 def _identify(c: PmdController) -> Steps[None]:

@@ -63,7 +63,7 @@ def write_export(record: CaseRecord, target: Path) -> int:
     """Write the zip atomically; return the number of its members. The case is not changed."""
     if record.case() is None:
         raise ExportError(f"{record.case_dir}: no case was begun here")
-    record.verify_events()
+    whole = record.verify()
     fresh = target.with_name(target.name + ".part")
     digests: dict[str, str] = {}
     missing: list[str] = []
@@ -77,6 +77,7 @@ def write_export(record: CaseRecord, target: Path) -> int:
                 "version": FORMAT_VERSION,
                 "sha256": digests,
                 "missing": missing,
+                "record": asdict(whole),
             }
             archive.writestr("MANIFEST.json", json.dumps(manifest, indent=1))
         os.replace(fresh, target)

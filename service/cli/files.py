@@ -33,7 +33,7 @@ def files_of(paths: Sequence[Path]) -> list[Path]:
 def geometry_of(header: Slice, file: Path) -> SliceGeometry:
     """Return where the slice lies in the patient, or refuse the file."""
     if header.geometry is None:
-        raise BadFileError(f"{file}: no geometry in the header")
+        raise BadFileError(f"{file}: {header.geometry_problem}")
     return header.geometry
 
 

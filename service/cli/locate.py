@@ -20,6 +20,7 @@ from dicom_slice.read import Frame, read_frames
 from dicom_slice.reasons import UnusableError
 from room_config.exit_codes import COULD_NOT, DONE
 from service.cli.files import BadFileError, files_of, geometry_of, read_shift_table
+from service.cli.locate_template import locate_by_template
 from sr_engine.checks import refuse_non_square
 from sr_engine.detect import detect
 from sr_engine.errors import EngineError, NoRoundObjectError
@@ -37,6 +38,13 @@ def locate(
     shifts: Annotated[
         Path | None, typer.Option(help="CSV file,row_px,col_px: one object, all files together.")
     ] = None,
+    template: Annotated[
+        Path | None,
+        typer.Option(
+            help="CSV file,row_px,col_px: learn the object's image from these files, beside the "
+            "table, and fit it in every file of PATH."
+        ),
+    ] = None,
     method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "ml",
     radius_mm: Annotated[str, typer.Option(help="Smallest and largest radius: LO,HI.")] = "2,20",
     roi: Annotated[str, typer.Option(help="Pixels R0,C0,R1,C1 to look in.")] = "",
@@ -48,7 +56,11 @@ def locate(
         raise BadFileError(f"--method {method}: known are {', '.join(METHODS)}")
     radii_mm = _numbers(radius_mm, 2, "--radius-mm")
     region = tuple(round(x) for x in _numbers(roi, 4, "--roi")) if roi else None
-    if shifts is not None:
+    if template is not None and (shifts is not None or method != "ml"):
+        raise BadFileError("--template goes with neither --shifts nor --method")
+    if template is not None:
+        found, shown, problems = _locate_by_template(path, template, radii_mm, region)
+    elif shifts is not None:
         found, shown, problems = _locate_together(path, shifts, method, radii_mm)
     else:
         found, shown, problems = _locate_each(path, method, radii_mm, region)
@@ -108,6 +120,20 @@ def _locate_each(
             if not rows:
                 problems.append(f"{_name(file, frame[0])}: no round object of {_range(radii_mm)}")
     return found, shown, problems
+
+
+def _locate_by_template(
+    paths: Sequence[Path],
+    table: Path,
+    radii_mm: Sequence[float],
+    region: tuple[int, ...] | None,
+) -> tuple[Rows, Shown, list[str]]:
+    try:
+        results, problems = locate_by_template(paths, table, radii_mm, region)
+    except EngineError as error:
+        return [], [], [f"{table}: {error}"]
+    rows = [{**result.row, "_found": result} for _, result in results]
+    return rows, [(frame, [row]) for (frame, _), row in zip(results, rows, strict=True)], problems
 
 
 def _round_objects(

@@ -25,6 +25,7 @@ SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "robot": ("robot_bridge.engineer.main:main", "Engineer's commands for bridge and motors."),
     "emulator": ("robot_bridge.emulator.main:main", "Emulated motor controllers alone."),
     "scanner": ("simulator.command_line:scanner", "The virtual scanner alone."),
+    "camera": ("bench.command_line:app", "A camera over the robot in the scanner's place."),
     "locate": ("service.cli.locate:app", "Find the round objects in DICOM files."),
     "reconstruct": (
         "service.cli.reconstruct_files:app",

@@ -88,7 +88,7 @@ def replay(
     if method is not None and method not in METHODS:
         raise ReplayError(f"no method {method!r}; known: {', '.join(METHODS)}")
     with CaseRecord(case) as record:
-        events = record.verify_events()
+        events = record.verify().events
         procedures = [replay_procedure(record, row) for row in record.procedures()]
         measurements = list(replay_measurements(record, method))
     if as_json:

@@ -68,12 +68,15 @@ def report_page(record: CaseRecord) -> str:
     case = record.case()
     if case is None:
         raise ReportError(f"{record.case_dir}: no case was begun here")
-    events = record.verify_events()
+    whole = record.verify()
     title = f"{case.name}: {_time(case.created_s)}"
     body = [
         f"<h1>{html.escape(title)}</h1>",
         '<p class="warning">Research software, not a medical device.</p>',
-        f"<p>Case {html.escape(case.case_uid)}, {events} events, their chain verifies.</p>",
+        (
+            f"<p>Case {html.escape(case.case_uid)}, {whole.events} events; the record "
+            f"verifies, its head is <code>{whole.head}</code>.</p>"
+        ),
         *_targets(record),
         *_approaches(record),
         *_needles(record),

@@ -13,6 +13,7 @@ import time
 from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import structlog
@@ -21,7 +22,9 @@ from case_record.cases import Cases
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Procedure
 from room_config.load import Config
+from service.procedure.approach import Arrival
 from service.procedure.calibration import Calibration
+from service.procedure.guide_approach import GuideArrival
 from service.procedure.guide_recording import GuidePlace
 from service.procedure.recording import Place
 from service.procedure.registry import build_procedure, result_to_json
@@ -34,6 +37,7 @@ from service.room.commands.commands import Commands
 from service.room.context import Room
 from service.room.describe import Describer, describe_robot
 from service.room.execution import Execution, ProcedureAbortedError
+from service.room.integrity import doubt_of, doubt_of_arrival
 from service.room.link import RoomLink
 from service.room.readiness import ConflictError
 from service.room.stage_witness import correct_counts
@@ -113,6 +117,7 @@ class ControlLoop:
         self._failure: BaseException | None = None
         self._on_failure = on_failure
         self._trouble = Trouble()
+        self._doubts: dict[Path, str] = {}
         self._failed_at: tuple[int, str] | None = None
         self._said_s = -_SAID_AGAIN_S
         self._commands: Commands | None = None
@@ -213,16 +218,27 @@ class ControlLoop:
 
     def _serve(self, record: CaseRecord) -> None:
         case = record.start_case(self._config.room.name, seed=0)
+        if record.case_dir not in self._doubts:
+            self._doubts[record.case_dir] = doubt_of(record)
+        record.doubt = self._doubts[record.case_dir]
         self._trouble.settle(record)
         execution = Execution(self._config, record, self._link, self._tick)
         self._commands = Commands(Room(self._config, record, self._link, execution, self._stops))
         self._record, self._execution = record, execution
-        self._describer = Describer(self._config, record, self._link, self._others_wrong)
+        self._describer = Describer(self._config, record, self._link, self._wrong)
         while True:
             self._tick()
             running = record.running_procedure()
             if running is not None:
                 self._run_one(running, case.case_uid)
+
+    def _wrong(self) -> Sequence[Condition]:
+        """What else is wrong than the state shows."""
+        if not self._record.doubt:
+            return self._others_wrong()
+        what = "Nothing may rest on it. Keep the folder as it is and begin a new case."
+        changed = Condition("record_changed", "alarm", self._record.doubt, what)
+        return [changed, *self._others_wrong()]
 
     def _hold(self) -> None:
         """For a while: keep the link, show what is wrong, refuse orders; then it is tried again."""
@@ -266,7 +282,12 @@ class ControlLoop:
         except Exception as error:
             self._fail_by_program(running, error)
         else:
-            self._finish_procedure(running, result)
+            try:
+                self._finish_procedure(running, result)
+            except RECORD_FAULTS:
+                raise
+            except Exception as error:
+                self._fail_by_program(running, error)
         self._execution.clear()
         self._keep_ready()  # READY is not shown before motion is locked
         self._publish()
@@ -284,6 +305,10 @@ class ControlLoop:
 
     def _finish_procedure(self, running: Procedure, result: Any) -> None:
         body = {"procedure_id": running.procedure_id, "name": running.name}
+        if isinstance(result, Arrival | GuideArrival) and not self._record.doubt:
+            measurement_id = int(result.to_json()["measurement_id"])
+            doubt = doubt_of_arrival(self._record, running.procedure_id, measurement_id)
+            self._doubts[self._record.case_dir] = self._record.doubt = doubt
         with self._record.transaction():
             self._record.end_procedure(running.procedure_id, "done", result_to_json(result))
             if isinstance(result, Place | GuidePlace):
@@ -319,6 +344,8 @@ class ControlLoop:
         self._answer_queue()
         if self._publish_if_due():
             self._keep_ready()
+            if self._commands is not None:
+                self._commands.look_for_plans()
         # last: what the waiting step looks at next is fresh, and screens do not delay a decision
         self._link.pump(_TICK_S)
 

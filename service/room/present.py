@@ -111,6 +111,8 @@ def rests_on(record: CaseRecord, status: BridgeStatus) -> dict[str, Any]:
 
 def why_not_now(record: CaseRecord, measurement: Measurement, now: Now) -> Lost | None:
     """Return why a finished measurement does not say any more where the fiducial is, or None."""
+    if record.doubt:
+        return Lost("record_changed", record.doubt)
     facts = measurement.request.get(RESTS_ON)
     if facts is None:
         return Lost("unknown", "it is not known what the measurement rests on")

@@ -31,7 +31,10 @@ from service.web.problems import add_problems, problem
 from service.web.routes.images import measurement_image_router, slice_image_router
 from service.web.routes.record import event_router, measurement_router, slice_router
 
-_READ = re.compile(r"/api/v1/(events|cases|targets|slices|measurements)(/(?!live$).*)?")
+_READ = re.compile(
+    r"/api/v1/(events|cases|targets|measurements|slices(/[^/]+)?"
+    r"|(measurements|slices)/[^/]+/(image\.png|pixels))"
+)
 _MOST_WAITING = 200
 _PATIENCE_S = 20.0
 _MOST_MEMORY_BYTES = 4 * 2**30

@@ -15,12 +15,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from room_config.exit_codes import COULD_NOT
 from service.client import RefusedByServiceError, RoomClient, ServiceGoneError
 from simulator.config import VirtualRoom
 from simulator.scene import true_fiducial_mm, true_guide
 from simulator.truth_client import TruthAddress, ask_where
+
+Vector = NDArray[np.float64]
 
 WHO = "virtual operator"
 _POLL_S = 0.05
@@ -165,23 +168,26 @@ class Operator:
         self._order(self._client.needle_out)
 
     def _result(self, arrival: dict[str, Any], target_mm: list[float]) -> PunctureResult:
-        stages = ask_where(self._truth)
-        depth_mm = arrival["tip_below_joint_mm"]
-        if depth_mm is None:
-            there_mm = true_fiducial_mm(self._room, stages.positions_mm)
-        else:
-            there_mm = true_guide(self._room, stages.positions_mm).at(-depth_mm)
-        # the needle guide is steered in the coronal plane: left-right and foot-head
-        miss = (np.asarray(there_mm) - np.asarray(target_mm))[[0, 2]]
         return PunctureResult(
             procedure_id=arrival["procedure_id"],
-            true_error_mm=float(np.linalg.norm(miss)),
+            true_error_mm=float(np.linalg.norm(self._miss_mm(arrival, target_mm))),
             estimated_error_mm=arrival["error_mm"],
             sigma_mm=arrival["sigma_mm"],
             iterations=arrival["iterations"],
             frames=arrival["frames"],
             scan_s=arrival["scan_s"],
         )
+
+    def _miss_mm(self, arrival: dict[str, Any], target_mm: list[float]) -> Vector:
+        """What is missing to the target in truth, along left-right and foot-head."""
+        stages = ask_where(self._truth)
+        depth_mm = arrival["tip_below_joint_mm"]
+        if depth_mm is None:
+            there_mm = true_fiducial_mm(self._room, stages.positions_mm)
+        else:
+            there_mm = true_guide(self._room, stages.positions_mm).at(-depth_mm)
+        # the needle guide is steered in the coronal plane
+        return np.asarray((np.asarray(there_mm) - np.asarray(target_mm))[[0, 2]])
 
     def _set_target(self, state: dict[str, Any]) -> None:
         """A point within reach, the same one for the same seed and puncture."""

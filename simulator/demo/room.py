@@ -86,6 +86,9 @@ class DemoRoom:
         self.url = str(self.family.start("service", autospine("service", *here))["url"])
         for child in slow:
             child.wait_ready(120.0)
+        self._start_scanner(here)
+
+    def _start_scanner(self, here: list[str]) -> None:
         self.family.start("scanner", autospine("scanner", *here))
 
     def check(self) -> None:
@@ -203,6 +206,7 @@ class DemoRoom:
         }
         if self.options.guide:
             tables["service.guide"] = _guide_table(virtual)
+        self._adapt(tables)
         axes = [self._axis_table(name, number) for number, name in enumerate(self.axes, start=1)]
         path = self.folder / _CONFIG
         text = "# Written by `autospine demo`.\n" + _toml(tables)
@@ -210,6 +214,9 @@ class DemoRoom:
         text += "".join(f"\n[[service.token]]\n{_toml_keys(t)}" for t in self._token_tables())
         path.write_text(text, encoding="utf-8")
         return path
+
+    def _adapt(self, tables: dict[str, dict[str, Any]]) -> None:
+        """Change the room's tables before they are written; as they are here."""
 
     def _token_tables(self) -> list[dict[str, str]]:
         """Who may use the service; the scanner finds its own token in its file."""

@@ -20,7 +20,7 @@ import trustme
 from listener_room import mr_data_set, needs_program, wait_for
 from pydicom import dcmread
 from pydicom.uid import UID, ExplicitVRBigEndian, ExplicitVRLittleEndian, JPEGLosslessSV1
-from pynetdicom import AE
+from pynetdicom import AE, StoragePresentationContexts
 from pynetdicom.association import Association
 from pynetdicom.dimse_primitives import C_STORE
 from real_slices import DICOM
@@ -31,7 +31,7 @@ from dicom_listener.negotiation import VERIFICATION
 from dicom_listener.requestor import mended
 from dicom_listener.scp import Scp, ScpRules, tls_context
 from dicom_listener.transport import acknowledge_at_once
-from dicom_slice.quirks import MR_IMAGE
+from dicom_slice.quirks import MR_CLASSES, MR_IMAGE
 
 FOLDER = DICOM / "hazen" / "nist_T2_site4_philips_plate5"
 CT_IMAGE = "1.2.840.10008.5.1.4.1.1.2"
@@ -213,6 +213,30 @@ def test_what_cannot_be_decoded_is_refused_at_negotiation_and_the_report_says_so
     assert "this kind of object is not stored here" in report
     assert "none of these encodings can be decoded here" in report
     assert "accepted in Explicit VR Little Endian" in report
+
+
+def test_of_many_contexts_only_what_matters_is_an_alarm_and_in_one_line(tmp_path):
+    """As a scanner proposes everything that it knows, on every association."""
+    mpeg = UID("1.2.840.10008.1.2.4.102")
+    others = [str(c.abstract_syntax) for c in StoragePresentationContexts]
+    others = [uid for uid in others if uid not in MR_CLASSES]
+    with serving(tmp_path, any_storage_class=False) as server:
+        for lost in (False, True):
+            for _ in range(3):
+                ae = AE("SCANNER")
+                ae.add_requested_context(MR_IMAGE, [mpeg] if lost else [ExplicitVRLittleEndian])
+                for uid in others[:59]:
+                    ae.add_requested_context(uid)
+                association = ae.associate("127.0.0.1", server.port, ae_title="AUTOSPINE")
+                assert association.is_established or lost
+                if association.is_established:
+                    association.release()
+            said = [text for kind, text in server.scp.alarms if kind == "contexts_refused"]
+            assert len(said) == lost, "each thing is said once"
+        assert "MR Image Storage in MPEG-4 AVC/H.264 High Profile" in said[0]
+        assert "can be decoded here" in said[0]
+        assert len(said[0]) < 300
+        assert len(server.scp.reports) == 6, "the whole account is kept beside"
 
 
 def test_low_disk_is_answered_out_of_resources_and_nothing_is_left_behind(tmp_path):

@@ -10,6 +10,10 @@ import numpy as np
 import pytest
 from attended_room import AttendedRoom, arm, calibrated, running_room, stop_all, wait_for
 from openigtlink_station import OwnStation, Station, station
+from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
+from pydicom.uid import ExplicitVRLittleEndian, generate_uid
+from pynetdicom import AE
+from pynetdicom.sop_class import SpatialFiducialsStorage
 
 from case_record.record import CaseRecord
 from service.client import RefusedByServiceError, RoomClient
@@ -339,6 +343,56 @@ def test_every_message_in_every_phase_changes_nothing_without_the_operator(room,
         by_peers = {e.kind for e in record.events() if e.who.startswith("OpenIGTLink")}
     kept = {"plan_proposed", "proposal_turned_away", "registration_received"}
     assert by_peers <= kept | {"stop", "emergency"}
+
+
+def spatial_fiducials(study: str, frame: str, place: tuple[float, float, float]) -> FileDataset:
+    """What a workstation sends: one point, labelled TARGET."""
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID = SpatialFiducialsStorage
+    meta.MediaStorageSOPInstanceUID = generate_uid()
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    made = FileDataset("", {}, file_meta=meta, preamble=bytes(128))
+    made.SOPClassUID, made.SOPInstanceUID = SpatialFiducialsStorage, meta.MediaStorageSOPInstanceUID
+    made.Modality, made.Manufacturer, made.ContentLabel = "FID", "Planning Station", "PLAN"
+    made.PatientID, made.PatientName = "VIRTUAL-1", "Phantom^Virtual"
+    made.StudyInstanceUID, made.SeriesInstanceUID = study, generate_uid()
+    point, group = Dataset(), Dataset()
+    point.FiducialIdentifier, point.ShapeType = "TARGET", "POINT"
+    point.ContourData = [f"{value:.3f}" for value in place]
+    group.FrameOfReferenceUID, group.FiducialSequence = frame, [point]
+    made.FiducialSetSequence = [group]
+    return made
+
+
+def test_a_plan_by_dicom_is_a_proposal_like_the_others(room, port):
+    with RoomClient(room.url, by="Olga") as client:
+        calibrated(client)
+        with CaseRecord(room.folder) as record:
+            header = record.last_slice("assigned").header
+        study, frame = header["study_instance_uid"], header["frame_of_reference_uid"]
+        place = beside(client.state(), 2.0)
+        before = client.state().target_patient_mm
+        workstation = AE("WORKSTATION")
+        workstation.add_requested_context(SpatialFiducialsStorage)
+        listener = room.virtual_table["scanner"]["listener_port"]
+        association = workstation.associate("127.0.0.1", listener, ae_title="AUTOSPINE")
+        for uid in ("1.2.3.4", frame):
+            sent = association.send_c_store(spatial_fiducials(study, uid, place))
+            assert sent.Status == 0
+        association.release()
+
+        def of_workstation(state: RoomState) -> list[Any]:
+            return [p for p in state.proposals if p.sender.startswith("WORKSTATION")]
+
+        (one,) = of_workstation(wait_for(client.state, of_workstation))
+        assert one.target_mm == pytest.approx(place, abs=1e-3)
+        assert one.via == "DICOM Spatial Fiducials"
+        assert client.state().target_patient_mm == before
+        client.take_proposal(one.number, in_water=False)
+        assert client.state().target_patient_mm == pytest.approx(place, abs=1e-3)
+        with CaseRecord(room.folder) as record:
+            turned_away = record.events_of_kind("proposal_turned_away")
+        assert any("frame of reference" in e.body["why"] for e in turned_away)
 
 
 def test_pyigtl_plans_and_stops(room, port):

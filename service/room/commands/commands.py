@@ -23,7 +23,8 @@ class Commands:
 
     def __init__(self, room: Room) -> None:
         self._room = room
-        self._by_name = {one.__name__: one for one in _all_of(room)}
+        self._proposals = ProposalCommands(room, TargetCommands(room))
+        self._by_name = {one.__name__: one for one in _all_of(room, self._proposals)}
 
     def carry_out(self, name: str, arguments: Mapping[str, Any]) -> Any:
         """Carry out a command; raises ConflictError if it cannot be done now."""
@@ -33,11 +34,14 @@ class Commands:
         """See `ready_keeper`: nobody asks for it, it is done all the time."""
         keep_ready(self._room)
 
+    def look_for_plans(self) -> None:
+        """See ProposalCommands: what workstations sent to the listener is proposed."""
+        self._proposals.look_for_plans()
 
-def _all_of(room: Room) -> tuple[Callable[..., Any], ...]:
+
+def _all_of(room: Room, proposals: ProposalCommands) -> tuple[Callable[..., Any], ...]:
     robot = RobotCommands(room)
     target, procedure, record = TargetCommands(room), ProcedureCommands(room), RecordCommands(room)
-    proposals = ProposalCommands(room, target)
     return (
         robot.reset,
         robot.note_stop,

@@ -8,6 +8,9 @@ from __future__ import annotations
 from dataclasses import asdict
 from typing import Any
 
+import structlog
+
+from case_record.rows import Event
 from service.procedure.registry import latest_calibration
 from service.room.commands.target import TargetCommands
 from service.room.context import Room
@@ -17,6 +20,7 @@ from service.room.proposals import (
     REFUSED,
     TAKEN,
     Plan,
+    Point3,
     ProposalBook,
     ProposalState,
     Verdict,
@@ -28,7 +32,9 @@ from service.room.proposals import (
 from service.room.reach import OutOfReachError, ReachUnknownError, check_reach, entry_of
 from service.room.readiness import ConflictError
 
+log = structlog.get_logger()
 TURNED_AWAY = "proposal_turned_away"
+PLAN_RECEIVED = "plan_received"  # by the listener
 REGISTRATION = "registration_received"
 
 
@@ -39,19 +45,57 @@ class ProposalCommands:
         self._room = room
         self._target = target
         self._book = ProposalBook()
+        self._seen_event_id = -1
 
-    def propose(self, plan: Plan, by: str) -> Verdict:
-        """Record a plan for the operator to see, unless it cannot be one."""
+    def look_for_plans(self) -> None:
+        """Propose what workstations have sent to the listener since the last look."""
+        record = self._room.record
+        newest = record.last_event_id()
+        if newest == self._seen_event_id:
+            return
+        if self._seen_event_id < 0:
+            done = [*record.events_of_kind(PROPOSED), *record.events_of_kind(TURNED_AWAY)]
+            self._seen_event_id = max((e.body.get("received", 0) for e in done), default=0)
+        events = record.events_of_kind(PLAN_RECEIVED, after_id=self._seen_event_id)
+        self._seen_event_id = newest
+        for event in events:
+            try:
+                self._propose_received(event)
+            except (KeyError, TypeError, ValueError):  # whatever stands in it must not end the loop
+                log.exception("plan not proposed", event_id=event.event_id)
+
+    def _propose_received(self, event: Event) -> None:
+        body = event.body
+        plan = Plan(
+            sender=body["sender"],
+            name=body["name"],
+            via=body["via"],
+            target_mm=_place(body.get("target_mm")),
+            entry_mm=_place(body.get("entry_mm")),
+            frame_of_reference_uid=body.get("frame_of_reference_uid", ""),
+        )
+        if "why" in body:
+            told = {"sender": plan.sender, "name": plan.name, "via": plan.via, "why": body["why"]}
+            self._room.note(TURNED_AWAY, plan.sender, {**told, "received": event.event_id})
+            return
+        self.propose(plan, plan.sender, received=event.event_id)
+
+    def propose(self, plan: Plan, by: str, received: int = 0) -> Verdict:
+        """Record a plan for the operator to see, unless it cannot be one.
+
+        received: the event by which it came, if it came by DICOM.
+        """
         known = self._book.update(self._room.record)
         mine = [one for one in known if one.state == "open" and _same(one, plan)]
         if mine:
             return Verdict("proposed", _waits(mine[0]), mine[0].number, not mine[0].note)
         verdict = self._judge(plan, known)
         if verdict.code != "proposed":
-            body = {"sender": plan.sender, "name": plan.name, "via": plan.via, "why": verdict.text}
-            self._room.note(TURNED_AWAY, by, body)
+            told = {"sender": plan.sender, "name": plan.name, "via": plan.via, "why": verdict.text}
+            self._room.note(TURNED_AWAY, by, {**told, "received": received})
             return verdict
-        body = {**_as_json(plan), "note": "" if verdict.reach_known else verdict.text}
+        note = "" if verdict.reach_known else verdict.text
+        body = {**_as_json(plan), "note": note, "received": received}
         self._room.note(PROPOSED, by, body)
         new = self._book.update(self._room.record)[-1]
         return Verdict("proposed", _waits(new), new.number, verdict.reach_known)
@@ -125,6 +169,13 @@ class ProposalCommands:
             done = f"{one.state} by {one.by}" if one.by else one.reason
             raise ConflictError("no_proposal", f"Proposal {number} is not open: {done}.")
         return one
+
+
+def _place(value: Any) -> Point3 | None:
+    if value is None:
+        return None
+    x, y, z = value
+    return float(x), float(y), float(z)
 
 
 def _as_json(plan: Plan) -> dict[str, Any]:

@@ -1,0 +1,104 @@
+"""`autospine camera`: a camera over the robot in the place of the scanner."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from bench.config import BenchRoom, CameraConfigError, load_bench
+from bench.operator import operate_bench
+from bench.optics import learn_lens
+from bench.preview import Preview
+from bench.slices import BenchCamera
+from bench.source import FrameSource, picture_files, read_picture
+from room_config.exit_codes import DONE
+from simulator.command_line import note_as, stop_event
+from simulator.scan_operator import TOKEN_VARIABLE
+
+app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+
+
+@app.command()
+def camera(
+    config: Annotated[
+        Path | None, typer.Option(help="The room's TOML file; its [camera] table.")
+    ] = None,
+    board: Annotated[
+        str, typer.Option(help="Pictures of a checkerboard (pattern or folder): learn the lens.")
+    ] = "",
+    squares: Annotated[str, typer.Option(help="Squares of the board: ROWSxCOLUMNS.")] = "8x11",
+    square_mm: Annotated[float, typer.Option(help="Side of a square.", min=0.1)] = 5.0,
+    out: Annotated[Path, typer.Option(help="Where the lens file goes.")] = Path("lens.json"),
+    exit_with_parent: Annotated[
+        bool, typer.Option(help="Stop when standard input is closed.")
+    ] = False,
+) -> int:
+    """Slices from a camera: acquires what the service asks for and sends it by C-STORE.
+
+    With --board it learns lens and scale from pictures of a checkerboard instead; the first one
+    lies flat where the circle will be.
+    """
+    if board:
+        return _learn(board, squares, square_mm, out)
+    if config is None:
+        raise CameraConfigError("give --config ROOM.toml, or --board PICTURES")
+    room = load_bench(config)
+    settings = room.camera
+    stop = stop_event(exit_with_parent)
+    note = note_as("camera")
+    bench_camera = BenchCamera(room)
+    source = FrameSource(settings.source, latency_s=settings.latency_s, stall_s=settings.stall_s)
+    with source, contextlib.ExitStack() as at_end:
+        bench_camera.slice_of([source.next_after(0)])  # scale and field are checked now
+        facts: dict[str, object] = {"ready": "camera"}
+        if settings.preview_port is not None:
+            preview = Preview(settings.preview_port, bench_camera, source)
+            at_end.callback(preview.close)
+            facts["preview"] = preview.url
+        operate_bench(
+            room,
+            bench_camera,
+            source,
+            stop,
+            note,
+            _token(room),
+            lambda: print(json.dumps(facts), flush=True),
+        )
+    return DONE
+
+
+def _learn(board: str, squares: str, square_mm: float, out: Path) -> int:
+    try:
+        rows, cols = (int(number) for number in squares.lower().split("x"))
+    except ValueError:
+        raise CameraConfigError(f"--squares {squares}: ROWSxCOLUMNS is wanted, as 8x11") from None
+    if min(rows, cols) < 3 or rows == cols:
+        raise CameraConfigError(f"--squares {squares}: at least 3, and not as many each way")
+    files = picture_files(board)
+    if not files:
+        raise CameraConfigError(f"--board {board}: no pictures there")
+    lens = learn_lens([read_picture(file) for file in files], (rows, cols), square_mm)
+    out.write_text(json.dumps(lens.to_json(), indent=1) + "\n", encoding="utf-8")
+    print(
+        f"{out}: {lens.px_per_mm:.4f} px/mm; the board's corners fit to {lens.residual_px:.2f} px "
+        f"({len(files)} pictures)"
+    )
+    return DONE
+
+
+def _token(room: BenchRoom) -> str:
+    """The token for the service, or '' where none is needed."""
+    if os.environ.get(TOKEN_VARIABLE):
+        return os.environ[TOKEN_VARIABLE].strip()
+    if not room.camera.token_file:
+        return ""
+    path = room.folder / room.camera.token_file
+    try:
+        return path.read_text(encoding="ascii").strip()
+    except (OSError, UnicodeDecodeError):
+        raise CameraConfigError(f"camera.token_file: {path} cannot be read") from None
