@@ -18,7 +18,7 @@ from robot_bridge.client.client import (
 )
 from robot_bridge.daemon.config import BridgeConfig
 from robot_bridge.engineer import sessions
-from robot_bridge.engineer.at_motors import drives_directly, stop_motors
+from robot_bridge.engineer.at_motors import drives_directly, stop_motors, what_boards_say
 from robot_bridge.engineer.terminal import CouldNotError, UsageError, axis_named, confirm, show
 from robot_bridge.protocol.framing import encode_stop
 from robot_bridge.protocol.phases import WorkPhase
@@ -67,8 +67,9 @@ def show_status(args: argparse.Namespace, config: BridgeConfig) -> None:
         if health is not None:
             show(args, health)
             return
+    of_boards = what_boards_say(config) if args.direct else {}
     with connected(args, config) as client:
-        show(args, _status_fields(client.status))
+        show(args, _status_fields(client.status) | of_boards)
 
 
 def _fresh_health(path: Path) -> dict[str, object] | None:

@@ -80,6 +80,21 @@ def find_encoder(args: argparse.Namespace, config: BridgeConfig) -> None:
     )
 
 
+def what_boards_say(config: BridgeConfig) -> dict[str, object]:
+    """Who they are, their supply and temperature, and what they do not answer."""
+    with sessions.bench(config) as (motors, _journal):
+        until_s = time.monotonic() + POWER_WAIT_S
+        while len((status := motors.poll()).supply) < len(config.axes):
+            if time.monotonic() > until_s or status.fault:
+                break
+            time.sleep(0.02)
+    return {
+        "boards": dict(status.boards),
+        "supply": {axis: dict(supply) for axis, supply in status.supply.items()},
+        "warnings": list(status.warnings),
+    }
+
+
 def drives_directly(args: argparse.Namespace, config: BridgeConfig) -> None:
     """Power of the motors off or on, with no bridge running."""
     with sessions.bench(config) as (motors, journal):
