@@ -3,7 +3,7 @@
 import ipaddress
 from datetime import UTC, date, datetime
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 from urllib.parse import SplitResult, urlsplit
 
 from pydantic import Field, field_validator, model_validator
@@ -11,6 +11,7 @@ from pydantic import Field, field_validator, model_validator
 from room_config.section import Section
 
 Strategy = Literal["base", "bicubic", "sr", "hybrid", "adaptive"]
+STRATEGIES: tuple[str, ...] = get_args(Strategy)
 
 
 _LOOPBACK = frozenset({"127.0.0.1", "localhost", "::1"})
@@ -166,6 +167,19 @@ class ServiceConfig(Section):
     confidence: float = Field(
         default=0.95, gt=0.5, lt=1, description="Probability with which the error must be below."
     )
+    tolerance_range_mm: tuple[float, float] = Field(
+        default=(0.03, 0.5),
+        description="On the page the tolerance of a case can be set within this.",
+    )
+    confidence_range: tuple[float, float] = Field(
+        default=(0.8, 0.999), description="On the page the confidence of a case can be set so."
+    )
+    most_slices: int = Field(
+        default=6, ge=1, le=32, description="Slices at one position at the most, to become sure."
+    )
+    most_slices_limit: int = Field(
+        default=16, ge=1, le=32, description="On the page that number can be set up to this."
+    )
     max_iterations: int = Field(default=8, ge=1, description="Moves of one approach at the most.")
     shift_set: Literal["single", "quarter", "half", "lattice5", "paper"] = Field(
         default="quarter",
@@ -229,6 +243,14 @@ class ServiceConfig(Section):
                 "public_url: others can reach the page by it: add [[service.token]] tables "
                 "(`autospine token NAME` makes one)"
             )
+        for name in ("tolerance_range_mm", "confidence_range"):
+            low, high = getattr(self, name)
+            if not 0 < low <= high:
+                raise ValueError(
+                    f"{name}: the first number must be above 0 and not above the other"
+                )
+        if not 0.5 < self.confidence_range[0] <= self.confidence_range[1] < 1:
+            raise ValueError("confidence_range: both must lie between 0.5 and 1")
         names = [token.name for token in self.token]
         if len(set(names)) != len(names):
             raise ValueError("two tokens have the same name")

@@ -235,6 +235,19 @@ class RoomClient:
     def set_entry(self, patient_mm: Sequence[float]) -> None:
         self._order("PUT", "/api/v1/entry", patient_mm=list(patient_mm))
 
+    def change_settings(
+        self, *, strategy: str, tolerance_mm: float, confidence: float, most_slices: int
+    ) -> None:
+        """Of this case, from its next procedure on; `state().belief` says what may be set."""
+        self._order(
+            "PUT",
+            "/api/v1/settings",
+            strategy=strategy,
+            tolerance_mm=tolerance_mm,
+            confidence=confidence,
+            most_slices=most_slices,
+        )
+
     def start_approach(self, *, guide: bool | None = None) -> int:
         """guide: to the line from entry to target; None: as the room is configured."""
         return self._start("/api/v1/approach", guide=guide)

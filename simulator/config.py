@@ -190,6 +190,9 @@ class ScannerSettings(_Table):
     """Port of that."""
     truth_file: str
     """JSON lines, appended: the truth of each acquisition. Relative to the configuration."""
+    faults_file: str = ""
+    """File with the names of faults that befall every acquisition while they stand there, one a
+    line; read anew each time. Relative to the configuration. Empty: only the room's `faults`."""
     acquisition_s: Positive = 0.25
     """How long a slice takes."""
     gap_s: Annotated[float, Field(ge=0)] = 0.02

@@ -1,6 +1,7 @@
 """What goes wrong in a real room, switchable by name. Pure: the dice come in as an argument."""
 
 from collections.abc import Iterable
+from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
@@ -23,6 +24,17 @@ FAULTS = MappingProxyType(
         "motion_during_scan": "an acquisition that nobody asked for runs while the robot moves",
     }
 )
+
+
+def switched_on(path: str) -> frozenset[str]:
+    """The faults that a file names, one a line; none if there is no such file."""
+    if not path:
+        return frozenset()
+    try:
+        names = Path(path).read_text(encoding="ascii", errors="replace").split()
+    except FileNotFoundError:
+        return frozenset()
+    return frozenset(names) & frozenset(FAULTS)
 
 
 def strike(names: Iterable[str], probability: float, rng: np.random.Generator) -> frozenset[str]:

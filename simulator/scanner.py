@@ -17,7 +17,7 @@ from pydicom.dataset import Dataset
 from simulator.config import ScannerSettings, VirtualRoom, VirtualRoomError
 from simulator.dicom_writer import AcquisitionStamp, Series, Study, write_mr_image
 from simulator.enhanced_writer import write_enhanced_mr_image
-from simulator.faults import corrupt, distorted, jumped_clock_s, phase_of, strike
+from simulator.faults import corrupt, distorted, jumped_clock_s, phase_of, strike, switched_on
 from simulator.mr_slice import AcquiredSlice, StagePath, acquire
 from simulator.outbox import Outbox
 from simulator.truth_client import TruthAddress, TruthError, ask_path, ask_where
@@ -109,9 +109,11 @@ class VirtualScanner:
 
     def scan_if_moving(self, stop: threading.Event) -> bool:
         """With the fault: acquire unasked if the robot is just moving; whether it did so."""
-        if "motion_during_scan" not in self._room.faults:
+        name = "motion_during_scan"
+        switched_on = name in self._switched_on()
+        if not switched_on and name not in self._room.faults:
             return False
-        if not ask_where(self._address).moving or not self._strikes("motion_during_scan"):
+        if not ask_where(self._address).moving or not (switched_on or self._strikes(name)):
             return False
         scan = self._scan(None, 0, stop, frozenset({"motion_during_scan"}))
         self._send(scan, self._new_series("fl2d_cor_guide", ("M", "ND", "NORM")))
@@ -131,7 +133,7 @@ class VirtualScanner:
     ) -> Scan:
         if faults is None:
             befallen = strike(self._room.faults, self._room.fault_probability, self._dice)
-            faults = befallen - {"motion_during_scan"}
+            faults = (befallen | self._switched_on()) - {"motion_during_scan"}
         if "clock_jump" in faults and self._jump_s == 0:
             self._jump_s = jumped_clock_s(self._dice)
             self._truth.write("clock_jump", by_s=self._jump_s)
@@ -245,6 +247,10 @@ class VirtualScanner:
     def _new_series(self, description: str, image_type: tuple[str, ...]) -> Series:
         self._series += 1
         return Series.new(self._series, description, image_type, self.clock_s(time.time()))
+
+    def _switched_on(self) -> frozenset[str]:
+        """The faults that somebody switched on while the room runs."""
+        return switched_on(self._settings.faults_file)
 
     def _strikes(self, fault: str) -> bool:
         return bool(strike([fault], self._room.fault_probability, self._dice))

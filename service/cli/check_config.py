@@ -10,6 +10,7 @@ import typer
 from robot_bridge.daemon.config import ConfigError as BridgeConfigError
 from robot_bridge.daemon.config import bridge_config_from_table
 from room_config.load import ConfigError, load_config
+from service.cli.room_checks import problems_of
 
 app = typer.Typer(add_completion=False)
 
@@ -18,10 +19,13 @@ app = typer.Typer(add_completion=False)
 def check_config(file: Annotated[Path, typer.Argument(help="The room's TOML file.")]) -> None:
     """Check a room's configuration."""
     config = load_config(file)
+    bridge = None
     if config.bridge:
         try:
-            bridge_config_from_table(config.bridge, str(file))
+            bridge = bridge_config_from_table(config.bridge, str(file))
         except BridgeConfigError as error:
             raise ConfigError(str(error)) from None
-    bridge = "with the bridge" if config.bridge else "without a bridge"
-    print(f"{file}: room {config.room.name!r} is well configured, {bridge}")
+    if problems := problems_of(config, bridge):
+        raise ConfigError(f"{file}: {'; '.join(problems)}")
+    scope = "bridge included" if bridge else "no [bridge] in this file"
+    print(f"{file}: configuration OK: room {config.room.name!r}, {scope}")

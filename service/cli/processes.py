@@ -20,6 +20,7 @@ from case_record.presence import Sole
 from room_config.load import Config, ConfigError, load_config
 from room_config.networks import with_mapped
 from room_config.shell import announce, configure_logs, on_parent_gone
+from service.cli.room_checks import LOOPBACK, open_to_others
 
 ConfigOption = Annotated[Path, typer.Option("--config", help="The room's TOML file.")]
 ParentOption = Annotated[
@@ -28,7 +29,6 @@ ParentOption = Annotated[
 FAILED = 3
 _LET_GO_S = 3.0
 _SWITCH_INTERVAL_S = 0.0002
-_LOOPBACK = ("127.0.0.1", "::1", "localhost")
 
 
 def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> None:
@@ -126,14 +126,11 @@ def worker(config: ConfigOption, exit_with_parent: ParentOption = False) -> None
 def bind(room: Config) -> socket.socket:
     """Return the listening socket of the page; ConfigError if that cannot be."""
     host, port = room.service.host, room.service.port
-    if host not in _LOOPBACK and not room.service.token:
-        raise ConfigError(
-            f"key service.host: {host} is not loopback: add [[service.token]] tables "
-            "(`autospine token NAME` makes one), or listen on 127.0.0.1"
-        )
+    if refused := list(open_to_others(room)):
+        raise ConfigError(refused[0])
     listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
-    if host not in _LOOPBACK and room.service.tls_certificate is None:
+    if host not in LOOPBACK and room.service.tls_certificate is None:
         structlog.get_logger().warning("tokens travel unencrypted: set service.tls_certificate")
     try:
         listening.bind((host, port))

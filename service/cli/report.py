@@ -2,39 +2,39 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import io
 import os
 from collections.abc import Iterable, Sequence
-from datetime import UTC, datetime
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import typer
-from matplotlib.backends.backend_agg import FigureCanvasAgg
-from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
 
 from case_record.record import CaseRecord
 from case_record.rows import Measurement
 from room_config.exit_codes import BAD_INPUT
+from service.cli.report_case import assigned_by_hand, case_table, punctures, settings
+from service.cli.report_html import (
+    STYLE,
+    html_table,
+    image_tag,
+    new_figure,
+    number_text,
+    time_text,
+)
 from service.procedure.estimate import axis_sigma
+from service.procedure.plane import ImagePlane
 from service.procedure.registry import APPROACHES, CALIBRATIONS
+from service.procedure.targets import all_targets
 from service.room.history import known_targets, targets_over_time
 from service.room.images import ImageMissingError, slice_pixels
 
 app = typer.Typer(add_completion=False)
 _CROP_PX = 16
 _CHI2_95 = 5.991
-_STYLE = """
-body { font: 15px/1.45 system-ui, sans-serif; margin: 2rem auto; max-width: 62rem; color: #222 }
-h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2rem }
-table { border-collapse: collapse } td, th { padding: .2rem .7rem; border-bottom: 1px solid #ddd }
-th { text-align: left; font-weight: 600 } td.n { text-align: right } img { max-width: 100% }
-.warning { background: #fff3cd; padding: .5rem .8rem }
-"""
+_SCALE_MM = 5.0
 
 
 class ReportError(ValueError):
@@ -69,7 +69,9 @@ def report_page(record: CaseRecord) -> str:
     if case is None:
         raise ReportError(f"{record.case_dir}: no case was begun here")
     whole = record.verify()
-    title = f"{case.name}: {_time(case.created_s)}"
+    described = record.last_event("case_described")
+    name = (described.body.get("label") if described else "") or case.name
+    title = f"{name}: {time_text(case.created_s)}"
     body = [
         f"<h1>{html.escape(title)}</h1>",
         '<p class="warning">Research software, not a medical device.</p>',
@@ -77,17 +79,21 @@ def report_page(record: CaseRecord) -> str:
             f"<p>Case {html.escape(case.case_uid)}, {whole.events} events; the record "
             f"verifies, its head is <code>{whole.head}</code>.</p>"
         ),
+        *case_table(record),
+        *punctures(record),
         *_targets(record),
+        *settings(record),
         *_approaches(record),
         *_needles(record),
         *_calibrations(record),
         *_plots(record),
         *_images(record),
         *_measurements(record),
+        *assigned_by_hand(record),
         *_set_aside(record),
         *_event_list(record),
     ]
-    head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{_STYLE}</style>'
+    head = f'<meta charset="utf-8"><title>{html.escape(title)}</title><style>{STYLE}</style>'
     return f"<!DOCTYPE html><html lang=en><head>{head}</head><body>{''.join(body)}</body></html>\n"
 
 
@@ -98,14 +104,14 @@ def _targets(record: CaseRecord) -> Iterable[str]:
             target.label,
             " ".join(f"{value:.3f}" for value in target.patient_mm),
             "tissue" if target.in_water else "fiducial",
-            _time(target.set_s),
+            time_text(target.set_s),
             target.who,
             ", ".join(str(number) for number in target.approaches),
         )
         for target in known_targets(record)
     ]
     yield "<h2>Targets</h2>"
-    yield _table(("no.", "label", "patient mm (LPS)", "of", "set", "by", "approaches"), rows)
+    yield html_table(("no.", "label", "patient mm (LPS)", "of", "set", "by", "approaches"), rows)
 
 
 def _needles(record: CaseRecord) -> Iterable[str]:
@@ -120,10 +126,10 @@ def _needles(record: CaseRecord) -> Iterable[str]:
             (
                 row.procedure_id,
                 *(" ".join(f"{x:.3f}" for x in result[name]) for name in ("joint_mm", "tip_mm")),
-                _number(result["tip_below_joint_mm"], 1, 1),
+                number_text(result["tip_below_joint_mm"], 1, 1),
                 " ".join(f"{1000 * x:+.0f}" for x in result["tip_error_mm"]),
                 " ".join(f"{1000 * x:.0f}" for x in np.sqrt(np.diag(covariance))),
-                _number(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]), 1, 2),
+                number_text(covariance[0, 1] / np.sqrt(covariance[0, 0] * covariance[1, 1]), 1, 2),
             )
         )
     if rows:
@@ -133,11 +139,11 @@ def _needles(record: CaseRecord) -> Iterable[str]:
             "lower ball joint, patient mm",
             "tip, patient mm",
             "depth mm",
-            "tip error µm (row, col)",
+            "tip distance µm (row, col)",
             "σ µm (row, col)",
             "correlation",
         )
-        yield _table(heads, rows)
+        yield html_table(heads, rows)
 
 
 def _approaches(record: CaseRecord) -> Iterable[str]:
@@ -153,8 +159,8 @@ def _approaches(record: CaseRecord) -> Iterable[str]:
                 row.name.replace("_", " "),
                 row.arguments.get("target", ""),
                 row.state,
-                *(_number(result.get(name), 1000) for name in ("error_mm", "sigma_mm")),
-                _number(result.get("probability"), 1, 3),
+                *(number_text(result.get(name), 1000) for name in ("error_mm", "sigma_mm")),
+                number_text(result.get("probability"), 1, 3),
                 result.get("iterations", ""),
                 result.get("frames", ""),
                 f"{minutes:.1f}",
@@ -167,7 +173,7 @@ def _approaches(record: CaseRecord) -> Iterable[str]:
         "",
         "target",
         "state",
-        "error µm",
+        "distance µm",
         "σ µm",
         "P",
         "moves",
@@ -175,8 +181,7 @@ def _approaches(record: CaseRecord) -> Iterable[str]:
         "min",
         "reason",
     )
-    yield _table(heads, rows)
-    yield f"<p>Punctures recorded: {len(record.events_of_kind('puncture'))}.</p>"
+    yield html_table(heads, rows)
 
 
 def _calibrations(record: CaseRecord) -> Iterable[str]:
@@ -193,7 +198,7 @@ def _calibrations(record: CaseRecord) -> Iterable[str]:
         axes = ", ".join(found.get("jacobian", {}).get("axes", ()))
         rows.append((row.procedure_id, row.state, axes, shown, found.get("reason", "")))
     heads = ("no.", "state", "axes", "image Jacobian mm/mm (rows; per axis up, down)", "reason")
-    yield _table(heads, rows)
+    yield html_table(heads, rows)
 
 
 def _plots(record: CaseRecord) -> Iterable[str]:
@@ -208,21 +213,24 @@ def _plots(record: CaseRecord) -> Iterable[str]:
             sigmas.append(body.sigma_mm)
     if not numbers:
         return
-    figure, axes = _figure(8, 3)
+    figure, axes = new_figure(8, 3)
     axes.errorbar(numbers, errors, yerr=sigmas, fmt=".", capsize=2)
     axes.set(xlabel="measurement", ylabel="distance to target, mm", yscale="log")
     axes.grid(visible=True, which="both", alpha=0.3)
     yield "<h2>Distance to the target</h2>"
-    yield _image_tag(figure, "distance to the target over the measurements")
+    yield image_tag(figure, "distance to the target over the measurements")
 
 
 def _images(record: CaseRecord) -> Iterable[str]:
-    """The last slice of every approach around the fiducial, with its 95 % ellipse."""
+    """The last slice of every approach around fiducial and target."""
     shown = []
+    targets = {target.number: target for target in all_targets(record)}
     for row in record.procedures():
         if row.name in APPROACHES and row.state == "done" and row.result:
             measurement = record.measurement(int(row.result["measurement_id"]))
-            tag = _close_up(record, measurement, f"approach {row.procedure_id}")
+            target = targets.get(row.arguments.get("target", 0))
+            point = None if target is None else target.patient_mm
+            tag = _close_up(record, measurement, point, f"approach {row.procedure_id}")
             if tag:
                 shown.append(tag)
     if shown:
@@ -230,14 +238,17 @@ def _images(record: CaseRecord) -> Iterable[str]:
         yield from shown
 
 
-def _close_up(record: CaseRecord, measurement: Measurement, title: str) -> str:
+def _close_up(
+    record: CaseRecord, measurement: Measurement, target_mm: Sequence[float] | None, title: str
+) -> str:
+    """The fiducial with its 95 % ellipse, the target, and a scale."""
     found = measurement.result or {}
     try:
         pixels = slice_pixels(record, int(found["slice_id"]))
     except (ImageMissingError, KeyError):
         return ""
     row, col = found["centre_px"]
-    figure, axes = _figure(3, 3)
+    figure, axes = new_figure(3, 3)
     axes.imshow(pixels, cmap="gray")
     axes.set_xlim(col - _CROP_PX, col + _CROP_PX)
     axes.set_ylim(row + _CROP_PX, row - _CROP_PX)
@@ -248,7 +259,15 @@ def _close_up(record: CaseRecord, measurement: Measurement, title: str) -> str:
     height, width = 2 * np.sqrt(_CHI2_95 * variances)
     angle = float(np.degrees(np.arctan2(vectors[0, 1], vectors[1, 1])))
     axes.add_patch(Ellipse((col, row), width, height, angle=angle, fill=False, color="#fa4"))
-    return _image_tag(figure, title)
+    plane = ImagePlane.from_json(found["plane"])
+    if target_mm is not None:
+        offset_mm = plane.from_patient(list(target_mm)) - np.array(found["plane_mm"])
+        down, across = offset_mm / np.array(plane.spacing_mm)
+        axes.plot(col + across, row + down, "+", color="#fd4", markersize=14)
+    left, bottom = col - 0.9 * _CROP_PX, row + 0.9 * _CROP_PX
+    axes.plot([left, left + _SCALE_MM / plane.spacing_mm[1]], [bottom, bottom], color="w")
+    axes.text(left, bottom - 1, f"{_SCALE_MM:g} mm", color="w", fontsize=8)
+    return image_tag(figure, title)
 
 
 def _measurements(record: CaseRecord) -> Iterable[str]:
@@ -266,9 +285,9 @@ def _measurements(record: CaseRecord) -> Iterable[str]:
                 row.state,
                 found.get("n_frames", ""),
                 place,
-                _number(sigma, 1000),
-                _number(found.get("snr")),
-                _number(found.get("chi2_per_dof"), 1, 2),
+                number_text(sigma, 1000),
+                number_text(found.get("snr")),
+                number_text(found.get("chi2_per_dof"), 1, 2),
                 row.reason,
             )
         )
@@ -284,53 +303,23 @@ def _measurements(record: CaseRecord) -> Iterable[str]:
         "χ²/dof",
         "reason",
     )
-    yield _table(heads, rows)
+    yield html_table(heads, rows)
 
 
 def _set_aside(record: CaseRecord) -> Iterable[str]:
     rows = [
-        (row.slice_id, _time(row.received_s), row.reason_code, row.reason)
+        (row.slice_id, time_text(row.received_s), row.reason_code, row.reason)
         for row in record.slices(state="quarantined")
     ]
     if rows:
         yield "<h2>Slices that were set aside</h2>"
-        yield _table(("slice", "received", "code", "reason"), rows)
+        yield html_table(("slice", "received", "code", "reason"), rows)
 
 
 def _event_list(record: CaseRecord) -> Iterable[str]:
     rows = [
-        (event.event_id, _time(event.wall_s), event.source, event.who, event.kind)
+        (event.event_id, time_text(event.wall_s), event.source, event.who, event.kind)
         for event in record.newest_events(500)
     ]
     yield "<h2>Events (the newest 500)</h2>"
-    yield _table(("no.", "time", "source", "who", "what"), sorted(rows))
-
-
-def _table(heads: Sequence[str], rows: Iterable[Sequence[object]]) -> str:
-    first = "".join(f"<th>{html.escape(head)}</th>" for head in heads)
-    lines = [
-        "<tr>" + "".join(f"<td>{html.escape(str(cell))}</td>" for cell in row) + "</tr>"
-        for row in rows
-    ]
-    return f"<table><tr>{first}</tr>{''.join(lines)}</table>" if lines else "<p>None.</p>"
-
-
-def _figure(width: float, height: float) -> tuple[Figure, Any]:
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.add_subplot()
-
-
-def _image_tag(figure: Figure, text: str) -> str:
-    stream = io.BytesIO()
-    figure.savefig(stream, format="png", dpi=110)
-    data = base64.b64encode(stream.getvalue()).decode("ascii")
-    return f'<img alt="{html.escape(text)}" src="data:image/png;base64,{data}">'
-
-
-def _number(value: Any, factor: float = 1.0, digits: int = 1) -> str:
-    return "" if value is None else f"{float(value) * factor:.{digits}f}"
-
-
-def _time(instant_s: float) -> str:
-    return datetime.fromtimestamp(instant_s, UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+    yield html_table(("no.", "time", "source", "who", "what"), sorted(rows))

@@ -1,8 +1,10 @@
 // Requests to the service. What is refused is a Refusal whose text says what to do.
 
+import { TEXTS } from "./texts.js";
+
 export class Refusal extends Error {
   constructor(status, problem) {
-    super(problem.detail || problem.title || `the service answered ${status}`);
+    super(problem.detail || problem.title || TEXTS.refusal.status(status));
     this.status = status;
     this.code = problem.title ?? "";
   }
@@ -26,7 +28,7 @@ async function request(method, path, body, headers = {}) {
       body: body === undefined ? undefined : JSON.stringify(body),
     });
   } catch {
-    throw new Refusal(0, { detail: "The service does not answer." });
+    throw new Refusal(0, { detail: TEXTS.refusal.noAnswer });
   }
   if (answer.ok) return answer;
   let problem = {};

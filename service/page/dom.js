@@ -12,7 +12,7 @@ function fill(element, attributes, children) {
     else if (name in element && !(element instanceof SVGElement)) element[name] = value;
     else element.setAttribute(name, value === true ? "" : value);
   }
-  element.append(...children.flat().filter((child) => child !== null && child !== undefined));
+  element.append(...children.flat(Infinity).filter((child) => child !== null && child !== undefined));
   return element;
 }
 
@@ -33,8 +33,21 @@ export function setHidden(element, hidden) {
   if (element.hidden !== hidden) element.hidden = hidden;
 }
 
+// What identifies a control from one drawing to the next.
+function signature(element) {
+  const same = (other) => other.tagName === element.tagName && other.id === element.id
+    && (other.getAttribute("aria-label") ?? other.textContent) === (element.getAttribute("aria-label") ?? element.textContent);
+  return same;
+}
+
+// Draws anew. The keyboard stays where it was; where its control is gone, at the section's head.
 export function replace(element, ...children) {
-  element.replaceChildren(...children.flat().filter((child) => child !== null));
+  const focused = document.activeElement;
+  const same = element.contains(focused) && focused !== element ? signature(focused) : null;
+  element.replaceChildren(...children.flat(Infinity).filter((child) => child !== null && child !== undefined));
+  if (!same || element.contains(document.activeElement)) return;
+  const again = [...element.querySelectorAll(focused.tagName)].find(same) ?? element.closest("[tabindex='-1']");
+  again?.focus({ preventScroll: true });
 }
 
 // Calls `draw` only when what it would draw from is different from the last time.
@@ -46,4 +59,11 @@ export function whenChanged(draw) {
     before = now;
     draw(value, ...rest);
   };
+}
+
+// At most so many rows at once: long lists grow on demand instead of scrolling inside the page.
+export function shortened(rows, most, words, isOpen, onToggle) {
+  if (rows.length <= most) return [rows, null];
+  const button = h("button", { type: "button", class: "small more", onclick: onToggle }, isOpen ? words.fewer : words.more);
+  return [isOpen ? rows : rows.slice(0, most), button];
 }

@@ -36,3 +36,8 @@ export function plain(name) {
   const words = String(name).replaceAll("_", " ").toLowerCase();
   return words.charAt(0).toUpperCase() + words.slice(1);
 }
+
+// "measured before the last move" -> "Measured before the last move."
+export function sentence(text) {
+  return text ? `${text.charAt(0).toUpperCase()}${text.slice(1)}${/[.?!]$/.test(text) ? "" : "."}` : "";
+}

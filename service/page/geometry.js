@@ -34,6 +34,24 @@ export const side = (direction) => pick(WORDS, direction);
 
 export const opposite = (direction) => direction.map((value) => -value);
 
+// Where a slice lies along its normal, as the console names it: "A 12.0" for 12 mm to the front.
+export function slicePosition(geometry) {
+  const down = geometry.row_direction;
+  const right = geometry.col_direction;
+  const normal = [right[1] * down[2] - right[2] * down[1], right[2] * down[0] - right[0] * down[2], right[0] * down[1] - right[1] * down[0]];
+  let axis = 0;
+  for (const k of [1, 2]) if (Math.abs(normal[k]) > Math.abs(normal[axis])) axis = k;
+  const middle = patientFromPixel(geometry, [(geometry.shape[0] - 1) / 2, (geometry.shape[1] - 1) / 2]);
+  return { axis, mm: middle[axis], letter: LETTERS[axis][middle[axis] >= 0 ? 0 : 1], plane: ["sagittal", "coronal", "axial"][axis] };
+}
+
+// How far a point lies in front of or behind a slice, mm along its normal.
+export function distanceFromSlice(geometry, pointMm) {
+  const [row, col] = pixelFromPatient(geometry, pointMm);
+  const foot = patientFromPixel(geometry, [row, col]);
+  return Math.hypot(...pointMm.map((value, k) => value - foot[k]));
+}
+
 // (row, col) mm in the slice -> "0.21 mm to head, 0.05 mm to left"
 export function inWords(geometry, rowMm, colMm, digits = 2) {
   const part = (value, direction) => {

@@ -1,34 +1,36 @@
-// The top line: work phase, link lights, banners, clock.
+// The top of the page: work phase, link lights, banners, clock, theme; and how tall it all is.
 
 import { byId, h, replace, setHidden, setText, whenChanged } from "./dom.js";
 import { age, plain } from "./format.js";
+import { TEXTS } from "./texts.js";
 
 const PHASES = ["START_UP", "CALIBRATION", "PLANNING", "TARGETING", "MOVE_TO_TARGET", "MANUAL"];
 const ALARM_PHASES = ["STOP", "EMERGENCY"];
 
-export const drawPhases = whenChanged(({ phase }) => {
-  const shown = ALARM_PHASES.includes(phase) ? [...PHASES, phase] : PHASES;
+const phase = (name) => TEXTS.phases[name] ?? plain(name);
+
+export const drawPhases = whenChanged(({ phase: now }) => {
+  const shown = ALARM_PHASES.includes(now) ? [...PHASES, now] : PHASES;
   replace(byId("phases"), shown.map((name) => h("li", {
     class: ALARM_PHASES.includes(name) ? "alarm" : null,
-    "aria-current": name === phase ? "step" : null,
-  }, plain(name))));
+    "aria-current": name === now ? "step" : null,
+  }, phase(name))));
 });
 
 // up: works, old: was heard but not lately, down: lost
 function lamp(name, condition, title) {
-  const words = { up: "works", down: "lost", old: "quiet", none: "not seen yet" };
   return h("li", { class: condition, title },
     h("span", { class: `lamp ${condition}`, "aria-hidden": "true" }), name,
-    h("span", { class: "skip" }, `: ${words[condition]}`));
+    h("span", { class: "heard" }, `: ${TEXTS.conditions[condition]}`));
 }
 
 export const drawLights = whenChanged(({ page, robot, processes }) => {
-  const rows = [
-    lamp("Service", page ? "up" : "down", page ? "This page is connected." : "This page is not connected."),
-    lamp("Robot", robot.linked ? "up" : "down", robot.linked ? `Bridge start ${robot.boot_id}` : robot.problem),
+  const { lamp: words } = TEXTS;
+  replace(byId("lights"), [
+    lamp(words.service, page ? "up" : "down", page ? words.connected : words.notConnected),
+    lamp(words.robot, robot.linked ? "up" : "down", robot.linked ? words.bridge(robot.boot_id) : robot.problem),
     ...(processes ?? []).map((process) => lamp(plain(process.name), process.condition, process.detail)),
-  ];
-  replace(byId("lights"), rows);
+  ]);
 });
 
 export function drawHead(state, connected) {
@@ -37,21 +39,24 @@ export function drawHead(state, connected) {
   setText(byId("room"), state.case?.label ? `${state.room} · ${state.case.label}` : state.room);
   setHidden(byId("banner-virtual"), !state.virtual);
   drawEmergency(state.robot.linked && state.robot.phase === "EMERGENCY");
-  document.title = `${state.ready ? "READY" : plain(state.robot.phase)} · AutoSPINe Navigator`;
+  document.title = `${state.ready ? "READY" : phase(state.robot.phase)} · ${TEXTS.title}`;
 }
 
 function drawEmergency(isOn) {
   const banner = byId("banner-emergency");
   setHidden(banner, !isOn);
   document.body.classList.toggle("emergency", isOn);
-  setText(banner, isOn ? "EMERGENCY: the robot is stopped and its drives are parked, without power. See to the patient and the needle first. Only Re-arm leaves this; measure again before any move, for parking shifts the stages a little." : "");
+  setText(banner, isOn ? TEXTS.banner.emergency : "");
 }
 
-export function showLost(seconds) {
-  document.body.classList.add("stale");
+// everConnected false: nothing was shown yet that could be old
+export function showLost(seconds, everConnected) {
   const banner = byId("banner-lost");
+  document.body.classList.toggle("stale", everConnected);
+  banner.classList.toggle("connecting", !everConnected);
   setHidden(banner, false);
-  setText(banner, `Connection lost: what is shown is ${age(seconds)} old. STOP is tried all the same; use the stop switch at the robot.`);
+  if (everConnected) setText(banner, Number.isFinite(seconds) ? TEXTS.banner.lost(age(seconds)) : TEXTS.banner.lostNow);
+  else setText(banner, seconds > 5 ? TEXTS.banner.unreachable : TEXTS.banner.connecting);
 }
 
 export function showUp() {
@@ -59,7 +64,7 @@ export function showUp() {
   setHidden(byId("banner-lost"), true);
 }
 
-export function startClock() {
+export function startHeader() {
   const tick = () => setText(byId("clock"), new Date().toLocaleTimeString("en-GB"));
   tick();
   setInterval(tick, 1000);
@@ -72,4 +77,17 @@ export function startClock() {
       // not remembered, still switched
     }
   };
+  const top = byId("top");
+  const act = byId("act");
+  const measure = () => {
+    const foot = byId("foot").offsetHeight;
+    document.documentElement.style.setProperty("--above", `${top.offsetHeight}px`);
+    document.documentElement.style.setProperty("--foot", `${foot}px`);
+    // what is taller than the screen goes with the page; STOP stays at its bottom edge
+    act.classList.toggle("tall", byId("act-scroll").offsetHeight + foot > innerHeight - top.offsetHeight + 1);
+  };
+  const watch = new ResizeObserver(measure);
+  [top, byId("next"), byId("numbers"), byId("pick-panel"), byId("needle"), byId("jog"), document.documentElement].forEach((one) => watch.observe(one));
+  addEventListener("resize", measure);
+  measure();
 }

@@ -1,90 +1,131 @@
-// The image area: newest slice and newest reconstruction, their overlay, window and level, picking.
+// The image area: the slice that is shown and the newest reconstruction, window and level, zoom.
 
-import { getPixels, order } from "./api.js";
-import { h, replace, s, setText, whenChanged } from "./dom.js";
-import { ellipse, patientFromPixel, pixelFromPatient } from "./geometry.js";
-import { act, arrow } from "./actions.js";
-import { natural, SliceView } from "./slice_view.js";
+import { getPixels } from "./api.js";
+import { h, replace, setText, whenChanged } from "./dom.js";
 import { age, clock } from "./format.js";
+import { distanceFromSlice, pixelFromPatient } from "./geometry.js";
+import { overlay } from "./overlay.js";
+import { Picking } from "./picking.js";
+import { drawProfile } from "./profile.js";
+import { SliceList } from "./slice_list.js";
+import { levelsOf, SliceView } from "./slice_view.js";
+import { TEXTS } from "./texts.js";
 
-const LAYOUTS = [["slice", "Slice"], ["both", "Both"], ["reconstruction", "Reconstruction"], ["blend", "Blended"]];
-const NUDGE_MM = 0.1;
+const { image: words } = TEXTS;
+const LAYOUTS = ["slice", "both", "reconstruction", "blend"];
+const NARROW_PX = 1100;
+// a fiducial is drawn on slices that lie this near to it, mm
+const SAME_SLICE_MM = 3;
 
 export class Images {
   constructor(root) {
     this.root = root;
     const on = {
       zoomed: (view) => this.follow(view),
-      pointed: (view, at) => this.point(view, at),
-      clicked: (view, at) => this.pickAt(at.patient_mm),
+      pointed: (view, at) => this.point(at),
+      clicked: (view, at) => this.picking.clicked(at.patient_mm),
       windowed: (view, dx, dy) => this.windowBy(dx, dy),
-      nudged: (event) => this.nudge(event),
+      nudged: (event) => this.picking.nudge(event),
     };
-    this.slice = new SliceView("Slice", on);
-    this.sr = new SliceView("Reconstruction", on);
-    this.layout = "both";
-    this.picked = null;
+    this.slice = new SliceView(words.sliceNumber, on);
+    this.sr = new SliceView(words.reconstruction, on);
+    this.picking = new Picking(this.slice, () => this.overlays());
+    this.chosen = null; // a slice of before that the operator wants to see; null: the newest
     this.build();
-    this.loadSlice = whenChanged((slice) => this.fetchSlice(slice));
-    this.loadSr = whenChanged((reconstruction) => this.fetchSr(reconstruction));
+    this.setLayout(innerWidth < NARROW_PX ? "slice" : "both");
+    this.loadSlice = whenChanged(({ id }) => this.fetchSlice(id));
+    this.loadSr = whenChanged(({ id }) => this.fetchSr(id));
     this.drawOverlay = whenChanged(() => this.overlays());
+    this.listSlices = whenChanged(() => this.list.refresh(this.shownId()).catch(() => { /* the stream says when the service is back */ }));
     setInterval(() => this.tickAge(), 500);
   }
 
   build() {
-    this.buttons = LAYOUTS.map(([layout, words]) => h("button", { type: "button", "aria-pressed": String(layout === this.layout), onclick: () => this.setLayout(layout) }, words));
-    this.window = h("input", { type: "range", min: 0, max: 1000, value: 500 , oninput: () => this.slid() });
+    const button = (text, run, more = {}) => h("button", { type: "button", onclick: run, ...more }, text);
+    this.buttons = LAYOUTS.map((layout) => button(words.layouts[layout], () => this.setLayout(layout)));
+    this.window = h("input", { type: "range", min: 0, max: 1000, value: 500, oninput: () => this.slid() });
     this.level = h("input", { type: "range", min: 0, max: 1000, value: 500, oninput: () => this.slid() });
     this.share = h("input", { type: "range", min: 0, max: 100, value: 50, oninput: () => this.repaint() });
-    this.shareLabel = h("label", { hidden: true }, "Blend ", this.share);
-    this.smooth = h("button", { type: "button", "aria-pressed": "false", class: "wide-only", onclick: () => this.toggleSmooth() }, "Smooth");
-    this.picking = h("button", { type: "button", id: "pick", "aria-pressed": "false", onclick: () => this.togglePick() }, "Pick target");
-    this.bar = h("div", { class: "bar" },
-      h("span", { class: "group", role: "group", "aria-label": "Which image" }, this.buttons),
-      h("label", {}, "Window ", this.window), h("label", {}, "Level ", this.level),
-      h("button", { type: "button", onclick: () => { this.manual = null; this.repaint(); } }, "Auto"),
-      this.shareLabel, this.smooth, h("span", { class: "push" }),
-      h("span", { class: "group", role: "group", "aria-label": "Zoom" },
-        h("button", { type: "button", "aria-label": "Zoom out", onclick: () => this.zoomBy(1 / 1.5) }, "−"),
-        h("button", { type: "button", onclick: () => this.zoomBy(0) }, "Whole"),
-        h("button", { type: "button", "aria-label": "Zoom in", onclick: () => this.zoomBy(1.5) }, "+"),
-        h("button", { type: "button", onclick: () => this.zoomToFiducial() }, "Fiducial")),
-      this.picking);
-    this.views = h("div", { class: "views" }, this.slice.root, this.sr.root);
+    this.shareLabel = h("label", { hidden: true }, words.blend, " ", this.share);
+    this.smooth = button(words.smooth, () => this.toggleSmooth(), { "aria-pressed": "false" });
+    this.profile = button(words.profile, () => this.toggleProfile(), { "aria-pressed": "false", id: "profile" });
+    this.newest = button(words.newest, () => this.choose(null), { hidden: true, id: "newest-slice" });
+    const bar = h("div", { class: "bar" },
+      h("span", { class: "group", role: "group", "aria-label": words.which }, this.buttons), this.newest,
+      h("label", {}, words.window, " ", this.window), h("label", {}, words.level, " ", this.level),
+      button(words.auto, () => { this.manual = null; this.repaint(); }),
+      this.shareLabel, this.smooth, this.profile, h("span", { class: "push" }),
+      h("span", { class: "group", role: "group", "aria-label": words.zoom },
+        button("−", () => this.zoomBy(1 / 1.5), { "aria-label": words.zoomOut }), button(words.whole, () => this.zoomBy(0)),
+        button("+", () => this.zoomBy(1.5), { "aria-label": words.zoomIn }), button(words.fiducial, () => this.zoomToFiducial())),
+      this.picking.button);
+    this.inset = h("div", { class: "inset", hidden: true });
+    this.slice.root.append(this.inset);
+    const strip = h("nav", { id: "strip", "aria-label": TEXTS.strip.heading });
     this.cursor = h("span", { class: "cursor" }, " ");
     this.ageText = h("span", { id: "image-age" });
     this.source = h("span", {});
-    this.pickBar = h("div", { class: "pick", hidden: true });
-    replace(this.root, this.bar, this.views, this.pickBar,
+    replace(this.root, bar,
+      h("div", { class: "stage" }, strip, h("div", { class: "views" }, this.slice.root, this.sr.root, h("section", { id: "needle", class: "view", "aria-labelledby": "h-needle", hidden: true }))),
       h("div", { class: "read" }, this.ageText, this.source, this.cursor));
+    this.list = new SliceList(strip, (row) => this.choose(row));
   }
 
   setLayout(layout) {
     this.layout = layout;
-    this.buttons.forEach((button, k) => button.setAttribute("aria-pressed", String(LAYOUTS[k][0] === layout)));
+    this.buttons.forEach((button, k) => button.setAttribute("aria-pressed", String(LAYOUTS[k] === layout)));
     this.slice.root.hidden = layout === "reconstruction";
-    this.sr.root.hidden = layout === "slice" || layout === "blend";
+    this.placeViews();
     this.shareLabel.hidden = layout !== "blend";
     this.repaint();
   }
 
+  // With two fiducials there is no reconstruction as a rule: beside the slice stands the needle then.
+  showsNeedle() {
+    return Boolean(this.state?.guide && !this.state.reconstruction && this.layout === "both");
+  }
+
+  placeViews() {
+    this.sr.root.hidden = this.layout === "slice" || this.layout === "blend" || this.showsNeedle();
+    const needle = this.root.querySelector("#needle");
+    if (needle) needle.hidden = !this.showsNeedle();
+  }
+
   draw(state, role) {
+    const before = this.state?.slice?.slice_id;
     this.state = state;
-    this.picking.disabled = role !== "operator" || !state.slice;
-    if (state.slice) this.loadSlice({ id: state.slice.slice_id });
-    const measured = state.measurement;
+    this.placeViews();
+    // a new slice is what matters: it is shown, unless somebody picks on an older one just now
+    if (before && state.slice?.slice_id !== before && !this.picking.isOn) this.chosen = null;
+    this.newest.hidden = !this.chosen;
+    this.picking.draw(state, role);
+    if (state.slice) this.loadSlice({ id: this.shownId() });
     if (state.reconstruction) this.loadSr({ id: state.reconstruction.measurement_id });
-    this.drawOverlay([state.slice, measured, state.target_patient_mm, state.entry_patient_mm, state.error, state.question?.plan, state.tolerance_mm, this.picked, state.other_fiducial, state.arrival]);
+    this.listSlices([state.last_slice_id, state.slices]);
+    this.drawOverlay([state.slice, state.measurement, state.target_patient_mm, state.entry_patient_mm, state.error, state.question?.plan, state.tolerance_mm, state.other_fiducial, state.arrival, state.belief?.fiducials]);
     this.tickAge();
   }
 
-  async fetchSlice({ id }) {
-    const geometry = this.state.slice;
+  shownId() {
+    return this.chosen?.slice_id ?? this.state?.slice?.slice_id;
+  }
+
+  // A slice of the list, or null for the newest one of the measurement.
+  choose(row) {
+    this.chosen = row && row.slice_id !== this.state.slice?.slice_id ? row : null;
+    this.newest.hidden = !this.chosen;
+    if (this.layout === "reconstruction") this.setLayout("slice");
+    this.loadSlice({ id: this.shownId() });
+  }
+
+  async fetchSlice(id) {
+    const geometry = this.chosen ? this.chosen.geometry : this.state.slice;
+    this.list.shown(id);
     try {
       const pixels = await getPixels(`api/v1/slices/${id}/pixels`);
-      if (this.state.slice.slice_id !== id) return;
-      this.slice.show(geometry, pixels, `Slice ${id}`);
-      this.shownSliceId = id;
+      if (this.shownId() !== id) return;
+      this.slice.show(geometry, pixels, this.chosen ? words.earlierSlice(id) : words.slice(id));
+      this.slice.what.classList.toggle("earlier", Boolean(this.chosen));
       requestAnimationFrame(() => performance.mark("slice-shown", { detail: id }));
     } catch (error) {
       this.slice.clear(error.message);
@@ -93,10 +134,10 @@ export class Images {
     this.overlays();
   }
 
-  async fetchSr({ id }) {
+  async fetchSr(id) {
     const geometry = this.state.reconstruction;
     try {
-      this.sr.show(geometry, await getPixels(`api/v1/measurements/${id}/pixels`), `×${geometry.factor}, measurement ${id}`);
+      this.sr.show(geometry, await getPixels(`api/v1/measurements/${id}/pixels`), words.ofMeasurement(geometry.factor, id, false));
     } catch (error) {
       this.sr.clear(error.message);
     }
@@ -104,10 +145,10 @@ export class Images {
     this.overlays();
   }
 
-  // Window and level: automatic for each image, or one choice relative to the automatic one.
-
+  // Window and level: automatic for each image, or one choice relative to the automatic one. The
+  // automatic one spans the whole fiducial: its plateau and edge are not burnt out.
   levels(view) {
-    const own = natural(view.pixels);
+    const own = levelsOf(view, view === this.sr ? this.state?.reconstruction : this.state?.measurement);
     if (!this.manual) return own;
     return { window: own.window * this.manual.window, level: own.level + own.window * this.manual.level };
   }
@@ -118,7 +159,7 @@ export class Images {
     for (const view of [this.slice, this.sr]) if (view.pixels) view.paint(this.levels(view));
     const blended = this.layout === "blend" && this.sr.pixels ? this.sr.pixels : null;
     if (this.slice.pixels) this.slice.blend(blended, blended ? this.levels(this.sr) : {}, this.share.value / 100);
-    if (!this.sr.pixels) this.sr.clear("No reconstruction yet: it needs frames at several commanded shifts.");
+    if (!this.sr.pixels) this.sr.clear(words.noReconstruction);
   }
 
   slid() {
@@ -133,9 +174,13 @@ export class Images {
   }
 
   toggleSmooth() {
-    const smooth = this.smooth.getAttribute("aria-pressed") !== "true";
-    this.smooth.setAttribute("aria-pressed", String(smooth));
+    const smooth = pressed(this.smooth);
     for (const view of [this.slice, this.sr]) view.root.classList.toggle("smooth", smooth);
+  }
+
+  toggleProfile() {
+    pressed(this.profile);
+    this.overlays();
   }
 
   zoomBy(factor) {
@@ -158,155 +203,44 @@ export class Images {
   // Side by side, both views look at the same place.
   follow(view) {
     const other = view === this.slice ? this.sr : this.slice;
-    if (this.layout !== "both" || !other.geometry || (other.zoom === view.zoom && String(other.middle) === String(view.middle))) return;
+    if (this.layout !== "both" || this.chosen || !other.geometry || (other.zoom === view.zoom && String(other.middle) === String(view.middle))) return;
     other.zoom = view.zoom;
     other.middle = [...view.middle];
     other.place();
   }
 
-  point(view, at) {
-    setText(this.cursor, at ? `${at.words}  ·  row ${at.row.toFixed(1)}  column ${at.col.toFixed(1)}  ·  value ${at.value.toPrecision(4)}` : " ");
+  point(at) {
+    setText(this.cursor, at ? words.cursor(at.words, at.row.toFixed(1), at.col.toFixed(1), at.value.toPrecision(4)) : " ");
   }
 
   tickAge() {
-    const slice = this.state?.slice;
+    const slice = this.chosen ?? this.state?.slice;
     if (!slice) return;
-    setText(this.ageText, `Slice ${slice.slice_id}: received ${clock(slice.received_s)}, ${age(Date.now() / 1000 - slice.received_s)} old`);
-    setText(this.source, `${slice.state}${slice.time_source ? ` · time from ${slice.time_source}` : ""}`);
+    setText(this.ageText, words.age(slice.slice_id, clock(slice.received_s), age(Date.now() / 1000 - slice.received_s)));
+    setText(this.source, words.source(TEXTS.strip.kinds[slice.state] ?? slice.state, slice.time_source));
   }
-
-  // The overlay
 
   overlays() {
     if (!this.state) return;
-    if (this.slice.geometry) this.slice.overlay(this.overlay(this.slice.geometry, this.state.measurement));
+    const { measurement, reconstruction } = this.state;
+    const picked = this.picking.point;
+    if (this.slice.geometry) {
+      const near = measurement?.patient_mm && distanceFromSlice(this.slice.geometry, measurement.patient_mm) < SAME_SLICE_MM;
+      this.slice.overlay(overlay(this.slice.geometry, this.state, { found: this.chosen && !near ? null : measurement, named: true, current: !this.chosen, picked }));
+    }
+    drawProfile(this.inset, this.profile.getAttribute("aria-pressed") === "true" ? this.slice.geometry : null, this.slice.pixels, measurement);
     if (!this.sr.geometry) return;
     // the robot may have moved since the reconstruction: show the fiducial where it was then
-    const current = this.state.reconstruction.measurement_id === this.state.measurement?.measurement_id;
-    const shown = this.state.reconstruction;
-    this.sr.overlay(this.overlay(this.sr.geometry, current ? this.state.measurement : { patient_mm: shown.patient_mm, radius_mm: shown.radius_mm }));
-    this.sr.what.textContent = `×${shown.factor}, measurement ${shown.measurement_id}${current ? "" : " (earlier)"}`;
+    const current = reconstruction.measurement_id === measurement?.measurement_id;
+    const found = current ? measurement : { patient_mm: reconstruction.patient_mm, radius_mm: reconstruction.radius_mm };
+    this.sr.overlay(overlay(this.sr.geometry, this.state, { found, current, picked }));
+    this.sr.what.textContent = words.ofMeasurement(reconstruction.factor, reconstruction.measurement_id, !current);
     this.sr.what.classList.toggle("earlier", !current);
   }
-
-  overlay(geometry, found) {
-    const { target_patient_mm: target, entry_patient_mm: entry, question, tolerance_mm: tolerance } = this.state;
-    const at = (pointMm) => {
-      const [row, col] = pixelFromPatient(geometry, pointMm);
-      return [col * geometry.spacing_mm[1], row * geometry.spacing_mm[0]];
-    };
-    const parts = [];
-    if (found?.patient_mm) {
-      const [x, y] = at(found.patient_mm);
-      const current = found.slice_id === this.state.slice?.slice_id;
-      const newest = found === this.state.measurement;
-      const shape = ellipse(found.covariance_mm2 ?? [[0, 0], [0, 0]], 3);
-      parts.push(s("circle", { id: geometry.factor ? null : "fiducial", cx: x, cy: y, r: found.radius_mm ?? 4, class: `thin c-fiducial${current ? "" : " dash"}` }),
-        cross(x, y, 0.7, "c-fiducial"),
-        s("ellipse", { rx: shape.long, ry: shape.short, transform: `translate(${x} ${y}) rotate(${shape.turnDeg})`, class: "thin c-fiducial" }));
-      const plan = question?.plan;
-      if (plan && newest) {
-        const [dRow, dCol] = plan.displacement_mm;
-        parts.push(arrow(x, y, x + dCol, y + dRow, Math.min(2, 0.4 * Math.hypot(dRow, dCol))),
-          s("circle", { cx: x + dCol, cy: y + dRow, r: found.radius_mm ?? 4, class: "thin c-plan dash" }));
-      }
-    }
-    parts.push(...this.guide(at, found));
-    if (target) parts.push(...mark(at(target), "c-target", tolerance));
-    if (entry) {
-      parts.push(...mark(at(entry), "c-entry", 0.8));
-      if (target) parts.push(s("line", { x1: at(entry)[0], y1: at(entry)[1], x2: at(target)[0], y2: at(target)[1], class: "thin c-entry dash" }));
-    }
-    if (this.picked) parts.push(...mark(at(this.picked), "c-plan dash", 1));
-    return parts;
-  }
-
-  // Two fiducials: the other one as it was seen in its own slice, the guide's axis through both, and
-  // at READY the needle from the lower ball joint to its tip; all projected onto this slice.
-  guide(at, found) {
-    const { other_fiducial: other, arrival } = this.state;
-    const parts = [];
-    if (other && found?.patient_mm) {
-      const [[x, y], [x0, y0]] = [at(other.patient_mm), at(found.patient_mm)];
-      parts.push(s("line", { x1: x0, y1: y0, x2: x, y2: y, class: "thin c-fiducial dash guide-axis" }),
-        s("circle", { cx: x, cy: y, r: other.radius_mm, class: "thin c-fiducial dash other-fiducial" }), cross(x, y, 0.7, "c-fiducial"));
-    }
-    if (arrival?.tip_mm && arrival.joint_mm) {
-      const [[x, y], [x0, y0]] = [at(arrival.tip_mm), at(arrival.joint_mm)];
-      parts.push(s("line", { x1: x0, y1: y0, x2: x, y2: y, class: "thin c-plan needle" }), cross(x, y, 1.2, "c-plan"));
-    }
-    return parts;
-  }
-
-  // Picking: click, look, correct with the arrow keys, then set.
-
-  togglePick() {
-    const on = this.picking.getAttribute("aria-pressed") !== "true";
-    this.picking.setAttribute("aria-pressed", String(on));
-    this.picked = null;
-    if (on && this.slice.geometry) {
-      const [rows, cols] = this.slice.geometry.shape;
-      this.pickAt(this.state.target_patient_mm ?? this.state.measurement?.patient_mm ?? patientFromPixel(this.slice.geometry, [rows / 2, cols / 2]));
-      this.slice.root.focus();
-    } else this.endPick();
-  }
-
-  endPick() {
-    this.picking.setAttribute("aria-pressed", "false");
-    this.picked = null;
-    this.pickBar.hidden = true;
-    this.overlays();
-  }
-
-  pickAt(pointMm) {
-    if (this.picking.getAttribute("aria-pressed") !== "true") return;
-    this.picked = pointMm;
-    this.pickBar.hidden = false;
-    const number = (k, name) => h("label", {}, `${name} `, h("input", {
-      type: "number", step: 0.01, value: pointMm[k].toFixed(2), "aria-label": `${name}, patient mm`,
-      onchange: (event) => { this.picked = this.picked.map((value, j) => (j === k && Number.isFinite(event.target.valueAsNumber) ? event.target.valueAsNumber : value)); this.overlays(); },
-    }));
-    this.inTissue ??= h("input", { type: "checkbox", id: "in-tissue" });
-    const withdraw = this.state.target_patient_mm ? h("button", {
-      type: "button", onclick: () => act(async () => { await order("POST", "api/v1/target/withdraw"); this.endPick(); }),
-    }, "Withdraw the target") : null;
-    replace(this.pickBar, h("span", {}, "Target, patient mm (LPS); arrow keys move it by 0.1 mm: "),
-      number(0, "x"), number(1, "y"), number(2, "z"),
-      h("label", { title: "The oil of the fiducial and the water of tissue do not appear at the same place: allow for it." }, this.inTissue, " lies in tissue"),
-      h("button", { type: "button", id: "set-target", onclick: () => act(() => this.setTarget("target")) }, "Set target"),
-      h("button", { type: "button", id: "set-entry", onclick: () => act(() => this.setTarget("entry")) }, "Set entry point"),
-      withdraw,
-      h("button", { type: "button", onclick: () => this.endPick() }, "Leave"));
-    this.overlays();
-  }
-
-  async setTarget(what) {
-    const more = what === "target" ? { in_water: this.inTissue.checked } : {};
-    await order("PUT", `api/v1/${what}`, { patient_mm: this.picked, ...more });
-    this.endPick();
-  }
-
-  nudge(event) {
-    if (!this.picked || !this.slice.geometry) return false;
-    const { row_direction: down, col_direction: right } = this.slice.geometry;
-    const ways = { ArrowLeft: [right, -1], ArrowRight: [right, 1], ArrowUp: [down, -1], ArrowDown: [down, 1] };
-    const way = ways[event.key];
-    if (!way) return false;
-    this.pickAt(this.picked.map((value, k) => value + way[1] * NUDGE_MM * way[0][k]));
-    return true;
-  }
 }
 
-function cross(x, y, size, kind) {
-  return s("path", { d: `M${x - size} ${y}h${2 * size}M${x} ${y - size}v${2 * size}`, class: `thin ${kind}` });
+function pressed(button) {
+  const on = button.getAttribute("aria-pressed") !== "true";
+  button.setAttribute("aria-pressed", String(on));
+  return on;
 }
-
-// A ring with four ticks: it can be seen from afar and leaves the point itself free.
-function mark([x, y], kind, radiusMm) {
-  const [near, far] = [2.2, 4.5];
-  return [
-    s("circle", { cx: x, cy: y, r: radiusMm, class: `thin ${kind}` }),
-    s("path", { d: `M${x - far} ${y}H${x - near}M${x + near} ${y}H${x + far}M${x} ${y - far}V${y - near}M${x} ${y + near}V${y + far}`, class: `thin ${kind}` }),
-  ];
-}
-

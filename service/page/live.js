@@ -51,6 +51,7 @@ export class Live {
   }
 
   watch() {
+    if (!this.source) return; // not asked yet: nobody has logged in
     const silentMs = performance.now() - this.heardMs;
     if (silentMs > SILENT_MS) this.lost(silentMs / 1000);
     // the browser gives up on some errors (a 401, a proxy's 502): ask again ourselves

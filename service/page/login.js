@@ -2,6 +2,9 @@
 
 import { get, order, useCsrf } from "./api.js";
 import { byId, h, replace } from "./dom.js";
+import { TEXTS } from "./texts.js";
+
+const { login: words } = TEXTS;
 
 // {name, role, csrf}: who this browser is to the service
 export async function whoAmI() {
@@ -12,6 +15,7 @@ export async function whoAmI() {
 
 export function askForToken(onDone) {
   const dialog = byId("login");
+  if (dialog.open) return; // what is being typed stays
   const token = h("input", { id: "token", type: "password", autocomplete: "current-password", required: true });
   const refusal = h("p", { role: "alert", id: "login-refusal" });
   const form = h("form", {
@@ -26,11 +30,11 @@ export function askForToken(onDone) {
         token.select();
       }
     },
-  }, h("h2", { id: "h-login" }, "Log in to AutoSPINe Navigator"), h("label", { htmlFor: "token" }, "Your token"), token,
-  refusal, h("button", { class: "main" }, "Log in"));
+  }, h("h2", { id: "h-login" }, words.heading), h("label", { htmlFor: "token" }, words.token), token,
+  refusal, h("button", { class: "main" }, words.button));
   replace(dialog, form);
   dialog.addEventListener("cancel", (event) => event.preventDefault());
-  if (!dialog.open) dialog.showModal();
+  dialog.showModal();
 }
 
 export async function leave() {

@@ -1,32 +1,46 @@
 // Ties the page together: who is looking, the event stream, and what is drawn from the state.
 
 import { get, stopRobot } from "./api.js";
+import { act, Next, showRefusal } from "./actions.js";
+import { drawAlarms } from "./alarms.js";
+import { drawBelief } from "./belief.js";
 import { byId, setHidden, setText, whenChanged } from "./dom.js";
-import { drawHead, drawLights, showLost, showUp, startClock } from "./header.js";
+import { drawNumbers } from "./distance.js";
+import { drawHead, drawLights, showLost, showUp, startHeader } from "./header.js";
 import { drawHistory } from "./history_plot.js";
 import { Images } from "./images.js";
-import { addEvent, drawAlarms, drawAside, drawCase, drawJog, drawPast, drawTargets } from "./lists.js";
+import { addEvent, drawAside, drawCase, drawJog, drawPast, drawTargets } from "./lists.js";
 import { Live } from "./live.js";
 import { askForToken, leave, whoAmI } from "./login.js";
-import { act, Next } from "./actions.js";
+import { drawNeedle } from "./needle_view.js";
 import { drawProposals } from "./proposals.js";
-import { drawParts, keepCounting } from "./system_status.js";
 import { drawScannerClock, heardFromRoom } from "./scanner_clock.js";
-import { drawNumbers } from "./distance.js";
 import { drawStages } from "./stage_map.js";
+import { drawParts, keepCounting } from "./system_status.js";
+import { TEXTS } from "./texts.js";
 
 const page = { state: null, role: "viewer", measurements: [], connected: false };
 const images = new Images(byId("images"));
-const next = new Next();
+const next = new Next(() => images.picking.toggle());
+
+const HEADINGS = {
+  "h-alarms": TEXTS.alarms, "h-belief": TEXTS.belief, "h-history": TEXTS.history, "h-stages": TEXTS.stages, "h-events": TEXTS.events,
+  "h-aside": TEXTS.aside, "h-targets": TEXTS.targets, "h-past": TEXTS.past, "h-case": TEXTS.caseCard, "h-clock": TEXTS.clock,
+  "h-parts": TEXTS.system, "h-error": TEXTS.distance,
+};
+for (const [id, { heading }] of Object.entries(HEADINGS)) setText(byId(id), heading);
+setText(document.querySelector("#jog summary"), TEXTS.jog.heading);
+setText(byId("leave"), TEXTS.login.leave);
 
 function draw(state) {
   if (page.state && (page.state.case_uid !== state.case_uid || page.state.service_id !== state.service_id)) return location.reload();
   page.state = state;
-  const { robot, question } = state;
+  const { robot, question, belief } = state;
   drawHead(state, page.connected);
   next.draw(state, page.role);
   images.draw(state, page.role);
-  drawNumbers({ error: state.error, measurement: state.measurement, tolerance_mm: state.tolerance_mm, arrival: state.arrival, slice: state.slice, guide: state.guide });
+  drawNumbers({ error: state.error, measurement: state.measurement, tolerance_mm: state.tolerance_mm, arrival: state.arrival, slice: state.slice, guide: state.guide, reason: state.error_reason, plan: question?.plan ?? null });
+  drawNeedle({ guide: state.guide && images.showsNeedle(), entry: state.entry_patient_mm, target: state.target_patient_mm, fiducials: belief?.fiducials ?? [], arrival: state.arrival });
   drawStages({ robot: { travel_um: robot.travel_um, positions_um: robot.positions_um, position_certain: robot.position_certain }, plan: question?.plan });
   drawAlarms(state.alarms ?? []);
   drawProposals({ proposals: state.proposals ?? [], role: page.role });
@@ -34,11 +48,16 @@ function draw(state) {
   drawCase({ description: state.case, case_uid: state.case_uid, role: page.role });
   drawScannerClock({ clock: state.clock, clock_implies: state.clock_implies, role: page.role });
   drawParts({ robot: { linked: robot.linked, boot_id: robot.boot_id, problem: robot.problem }, processes: state.processes, slices: state.slices });
+  if (belief) drawBelief({ ...belief, settings: page.role === "operator" ? belief.settings : null });
   newAside([state.slices.quarantined, state.hold?.hold_id, page.role]);
   newTargets([state.target_patient_mm, state.procedure, page.role]);
   newPast([state.procedure, state.punctured, state.case]);
   newMeasurements([state.measurement?.measurement_id, state.measurement?.state, state.target_patient_mm]);
+  sayPhase(robot.phase);
 }
+
+// A screen reader hears the phase when it changes (prompt and alarms are live regions of their own).
+const sayPhase = whenChanged((phase) => setText(byId("heard"), TEXTS.phases[phase] ?? phase));
 
 const quietly = (promise) => promise.catch(() => { /* the stream says when the service is back */ });
 const newAside = whenChanged(() => quietly(drawAside(page.state, page.role)));
@@ -58,9 +77,9 @@ async function pressStop(emergency = false) {
     await stopRobot(emergency);
     button.classList.add("sent");
     setTimeout(() => button.classList.remove("sent"), 3000);
-    setText(byId("refusal"), "");
+    showRefusal("");
   } catch (error) {
-    setText(byId("refusal"), `STOP could not be sent: ${error.message} Use the stop switch at the robot.`);
+    showRefusal(TEXTS.next.stopFailed(error.message));
   }
 }
 
@@ -71,7 +90,7 @@ const live = new Live({
   onUp: () => { page.connected = true; showUp(); },
   onDown: async (seconds, failures) => {
     page.connected = false;
-    showLost(seconds);
+    showLost(seconds, page.state !== null);
     if (page.state) drawLights({ page: false, robot: page.state.robot, processes: page.state.processes });
     if (failures === 4) await quietly(begin());
   },
@@ -86,7 +105,7 @@ async function begin() {
     throw error;
   }
   page.role = me.role;
-  setText(byId("who"), me.needs_token ? `${me.name} (${me.role})` : "");
+  setText(byId("who"), me.needs_token ? TEXTS.login.who(me.name, me.role) : "");
   setHidden(byId("leave"), !me.needs_token);
   const events = await get("api/v1/events?newest=true&limit=120");
   byId("events").replaceChildren();
@@ -102,5 +121,20 @@ byId("leave").onclick = () => act(leave);
 addEventListener("keydown", (event) => {
   if (event.key === "Escape") pressStop();
 }, { capture: true });
-startClock();
-begin().catch(() => showLost(NaN));
+startHeader();
+
+// Until the service answers for the first time: again and again.
+async function start() {
+  const sinceMs = performance.now();
+  for (;;) {
+    try {
+      await begin();
+      return setHidden(byId("banner-lost"), true);
+    } catch {
+      showLost((performance.now() - sinceMs) / 1000, false);
+      await new Promise((done) => { setTimeout(done, 500); });
+    }
+  }
+}
+
+start();

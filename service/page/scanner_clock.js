@@ -5,6 +5,9 @@ import { order } from "./api.js";
 import { byId, h, replace, setText, whenChanged } from "./dom.js";
 import { act } from "./actions.js";
 import { age, day } from "./format.js";
+import { TEXTS } from "./texts.js";
+
+const { clock: words } = TEXTS;
 
 const DAY_S = 86400;
 // a person presses within this of the second that is shown: its rounding, and the time to react
@@ -48,31 +51,31 @@ export function offsetS(shown, pressedMs) {
 }
 
 function inWords(offset) {
-  if (Math.abs(offset) < 0.05) return "goes like the room's";
-  return `is ${Math.abs(offset).toFixed(1)} s ${offset < 0 ? "ahead of" : "behind"} the room's`;
+  if (Math.abs(offset) < 0.05) return words.same;
+  return (offset < 0 ? words.ahead : words.behind)(Math.abs(offset).toFixed(1));
 }
 
 export const drawScannerClock = whenChanged(({ clock, clock_implies, role }) => {
   const known = clock
-    ? [`The scanner's clock ${inWords(clock.offset_s)}, ± ${clock.uncertainty_s} s; compared ${day(clock.compared_s)} by ${clock.who}, `, ageOf(clock.compared_s), ` ago. ${clock_implies}`]
+    ? [words.known(inWords(clock.offset_s), clock.uncertainty_s, words.compared(day(clock.compared_s), clock.who)), " (", ageOf(clock.compared_s), ` ${words.ago}). ${clock_implies}`]
     : [clock_implies];
   const input = h("input", { id: "scanner-shows", placeholder: "hh:mm:ss", inputMode: "numeric", autocomplete: "off", size: 9, disabled: role !== "operator" });
   const said = h("p", { class: "quiet", role: "status" });
   let offset = NaN;
-  const use = h("button", { type: "button", hidden: true, onclick: () => act(() => order("PUT", "api/v1/clock", { offset_s: offset, uncertainty_s: UNCERTAINTY_S })) }, "Use this");
+  const use = h("button", { type: "button", hidden: true, onclick: () => act(() => order("PUT", "api/v1/clock", { offset_s: offset, uncertainty_s: UNCERTAINTY_S })) }, words.use);
   const compare = h("button", {
     type: "button", disabled: role !== "operator",
     onclick: () => {
       offset = offsetS(input.value, Date.now());
       const good = Number.isFinite(offset);
-      setText(said, good ? `Then the scanner's clock ${inWords(offset)}.` : "Type what the scanner's clock shows, as 10:32:07.");
+      setText(said, good ? words.then(inWords(offset)) : words.bad);
       use.hidden = !good;
     },
-  }, "It shows this now");
+  }, words.now);
   const forget = h("button", {
-    type: "button", disabled: role !== "operator", title: "Slices wait until the clocks are compared again.",
-    onclick: () => act(() => order("POST", "api/v1/clock/reset", { why: "said on the page" })),
-  }, "It was set anew: forget this");
+    type: "button", disabled: role !== "operator", title: words.forgetTitle,
+    onclick: () => act(() => order("POST", "api/v1/clock/reset", { why: words.why })),
+  }, words.forget);
   replace(byId("scanner-clock"), h("p", { class: "quiet" }, ...known),
-    h("p", {}, h("label", { htmlFor: "scanner-shows" }, "The scanner shows "), input, " ", compare), said, use, clock ? h("p", {}, forget) : null);
+    h("p", { class: "row" }, h("label", { htmlFor: "scanner-shows" }, words.reads), input, compare), said, use, clock ? h("p", {}, forget) : null);
 });

@@ -2,23 +2,26 @@
 // columns, y along growing rows, (0, 0) at the centre of the reference slice's pixel (0, 0).
 
 import { h, replace, s } from "./dom.js";
-import { letter, opposite, patientFromPixel } from "./geometry.js";
+import { letter, opposite, patientFromPixel, pixelFromPatient } from "./geometry.js";
 import { mm } from "./format.js";
+import { TEXTS } from "./texts.js";
 
 const MOST_ZOOM = 64;
+// the brightest pixel of the fiducial is shown a little below white
+const HEADROOM = 1.06;
 
 export class SliceView {
   constructor(name, onChange) {
     this.onChange = onChange;
     this.canvas = h("canvas", {});
     this.second = h("canvas", { hidden: true });
-    this.svg = s("svg", { preserveAspectRatio: "none", role: "img", "aria-label": `${name} with overlay` });
+    this.svg = s("svg", { preserveAspectRatio: "none", role: "img", "aria-label": TEXTS.image.overlay(name) });
     this.inner = h("div", { class: "grid-mm" }, this.canvas, this.second, this.svg);
     this.sides = ["top", "bottom", "left", "right"].map((where) => h("span", { class: `side ${where}`, "aria-hidden": "true" }));
     this.what = h("span", { class: "what" });
     this.scale = h("span", { class: "scale", "aria-hidden": "true" });
-    this.empty = h("div", { class: "empty" }, "No slice yet.");
-    this.root = h("div", { class: "view", tabIndex: 0, role: "group", "aria-label": `${name}: arrow keys move, plus and minus zoom, 0 shows all` },
+    this.empty = h("div", { class: "empty" }, TEXTS.image.noSlice);
+    this.root = h("div", { class: "view", tabIndex: 0, role: "group", "aria-label": TEXTS.image.help(name) },
       this.inner, this.sides, this.what, this.scale, this.empty);
     this.zoom = 1;
     this.middle = null;
@@ -208,10 +211,22 @@ function paint(canvas, { values, rows, cols }, window, level, invert = false) {
   context.putImageData(image, 0, 0);
 }
 
-// The window in which all but the darkest and brightest pixels differ.
-export function natural({ values }) {
-  const sorted = Float32Array.from(values).sort();
+// The window in which all but the darkest and brightest pixels differ, and the whole fiducial does.
+export function levelsOf({ geometry, pixels }, found) {
+  const sorted = Float32Array.from(pixels.values).sort();
   const at = (part) => sorted[Math.min(sorted.length - 1, Math.floor(part * sorted.length))];
-  const [low, high] = [at(0.01), at(0.998)];
+  const low = at(0.01);
+  const high = Math.max(at(0.998), HEADROOM * brightest(geometry, pixels, found));
   return { window: Math.max(high - low, 1e-6), level: (high + low) / 2 };
+}
+
+function brightest(geometry, { values, rows, cols }, found) {
+  if (!found?.patient_mm) return 0;
+  const [row, col] = pixelFromPatient(geometry, found.patient_mm);
+  const reach = (found.radius_mm ?? 4) / Math.min(...geometry.spacing_mm);
+  let most = 0;
+  for (let r = Math.max(0, Math.round(row - reach)); r <= Math.min(rows - 1, row + reach); r += 1) {
+    for (let c = Math.max(0, Math.round(col - reach)); c <= Math.min(cols - 1, col + reach); c += 1) most = Math.max(most, values[r * cols + c]);
+  }
+  return most;
 }

@@ -2,8 +2,11 @@
 
 import { byId, replace, s, whenChanged } from "./dom.js";
 import { mm } from "./format.js";
+import { TEXTS } from "./texts.js";
 
-const STAGES = [["top stage", "xt", "yt"], ["bottom stage", "xb", "yb"]];
+const { stages: words } = TEXTS;
+
+const STAGES = [[words.top, "xt", "yt"], [words.bottom, "xb", "yb"]];
 
 const [SIDE, PAD] = [80, 10];
 
@@ -20,11 +23,11 @@ function one([name, x, y], robot, plan) {
   const text = (dx, dy, anchor, words) => s("text", { x: dx, y: dy, "text-anchor": anchor }, words);
   return s("svg", { viewBox: `${-PAD} ${-PAD} ${wide + 2 * PAD} ${high + 2 * PAD}`, role: "img",
     "aria-label": `${name}: ${x} ${mm(at[0] / 1000, 3)} mm, ${y} ${mm(at[1] / 1000, 3)} mm` },
-  s("rect", { width: wide, height: high, class: "thin", stroke: "var(--quiet)" }),
-  s("path", { d: `M0 ${high / 2}H${wide}M${wide / 2} 0V${high}`, class: "thin", stroke: "var(--line)" }),
+  s("rect", { width: wide, height: high, class: "thin c-quiet" }),
+  s("path", { d: `M0 ${high / 2}H${wide}M${wide / 2} 0V${high}`, class: "thin c-line" }),
   to && s("line", { x1: cx, y1: cy, x2: to[0], y2: to[1], class: "thin c-plan" }),
   to && s("circle", { cx: to[0], cy: to[1], r: 2.6, class: "thin c-plan" }),
-  s("circle", { cx, cy, r: 2, fill: robot.position_certain ? "var(--fiducial)" : "none", class: "thin c-fiducial" }),
+  s("circle", { cx, cy, r: 2, class: `thin c-fiducial${robot.position_certain ? " f-fiducial" : ""}` }),
   text(0, high + 7, "start", mm(x0 / 1000, 0)), text(wide, high + 7, "end", mm(x1 / 1000, 0)),
   text(wide / 2, high + 7, "middle", `${x} ${mm(at[0] / 1000, 3)} mm`),
   text(0, -3, "start", mm(y1 / 1000, 0)), text(wide / 2, -3, "middle", `${y} ${mm(at[1] / 1000, 3)} mm`));
@@ -32,5 +35,5 @@ function one([name, x, y], robot, plan) {
 
 export const drawStages = whenChanged(({ robot, plan }) => {
   const known = STAGES.filter(([, x, y]) => robot.travel_um[x] && robot.travel_um[y] && x in robot.positions_um && y in robot.positions_um);
-  replace(byId("stages"), known.length ? known.map((stage) => one(stage, robot, plan)) : "No link to the robot yet.");
+  replace(byId("stages"), known.length ? known.map((stage) => one(stage, robot, plan)) : words.noLink);
 });

@@ -1,30 +1,26 @@
-// Every part of the room with its state, and what the line to the robot counts.
+// Every part of the system with its state, and what the line to the robot counts.
 
 import { getText } from "./api.js";
 import { byId, h, replace, setText, whenChanged } from "./dom.js";
 import { plain } from "./format.js";
+import { TEXTS } from "./texts.js";
 
 const EVERY_MS = 5000;
-const COUNTED = [
-  ["autospine_link_frames_sent", "Frames sent to the robot"],
-  ["autospine_link_frames_resent", "sent again"],
-  ["autospine_link_frames_bad", "received damaged"],
-  ["autospine_viewers", "Screens open"],
-];
+const { system: words } = TEXTS;
 
 let values = {};
 
 const row = (name, value, kind) => h("tr", {}, h("th", { scope: "row" }, name), h("td", { class: kind }, value));
+const counter = (name, metric) => h("tr", {}, h("th", { scope: "row" }, name), h("td", { "data-metric": metric }, ""));
 
 export const drawParts = whenChanged(({ robot, processes, slices }) => {
-  const said = { up: "works", old: "does not get on", down: "has ended", none: "not seen yet" };
   const rows = [
-    row("Service", "works"),
-    row("Robot", robot.linked ? `linked, start ${robot.boot_id.slice(0, 8)}` : robot.problem, robot.linked ? "" : "wrong"),
-    ...processes.map((one) => row(plain(one.name), said[one.condition], one.condition === "up" ? "" : "wrong")),
-    row("Slices", Object.entries(slices).map(([name, count]) => `${count} ${name}`).join(", ") || "none"),
-    ...COUNTED.map(([name, words]) => h("tr", {}, h("th", { scope: "row" }, words), h("td", { "data-metric": name }, ""))),
-    h("tr", {}, h("th", { scope: "row" }, "Round trip to the robot"), h("td", { "data-metric": "autospine_link_round_trip_seconds" }, "")),
+    row(words.service, TEXTS.conditions.up),
+    row(words.robot, robot.linked ? words.linked(robot.boot_id.slice(0, 8)) : robot.problem, robot.linked ? "" : "wrong"),
+    ...processes.map((one) => row(plain(one.name), TEXTS.conditions[one.condition], one.condition === "up" ? "" : "wrong")),
+    row(words.slices, Object.entries(slices).map(([name, count]) => `${count} ${words.states[name] ?? name}`).join(", ") || words.none),
+    ...Object.entries(words.counters).map(([metric, name]) => counter(name, metric)),
+    counter(words.roundTrip, "autospine_link_round_trip_seconds"),
   ];
   replace(byId("parts"), h("table", {}, h("tbody", {}, rows)));
   showCounters();

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from service.procedure.calibration import Calibration
 from service.procedure.estimate import FiducialEstimate, axis_sigma, probability_within
+from service.procedure.plan import PlanPart
 from service.procedure.steering import Standing, SteeringArguments, frames_that_decide, steer
 from service.procedure.steps import ProcedureSteps
 from service.procedure.strategies import (
@@ -35,12 +36,12 @@ PROBABILITY, PAPER = "probability", "paper"
 class ApproachArguments(SteeringArguments):
     """What an approach is told.
 
-    target_mm: (2,) of the fiducial. stop_rule: `probability` (READY only with
-    P(error < tolerance) >= confidence) or `paper` (error below one pixel of the image looked at;
-    for the paper's studies). seed: of the random shift sets.
+    target_mm: (2,) of the fiducial. strategy: a name, or one of your own. stop_rule: `probability`
+    (READY only with P(error < tolerance) >= confidence) or `paper` (error below one pixel of the
+    image looked at; for the paper's studies). seed: of the random shift sets.
     """
 
-    strategy: str = "adaptive"
+    strategy: str | Strategy = "adaptive"
     stop_rule: str = PROBABILITY
     seed: int = 0
 
@@ -79,7 +80,8 @@ class SteeredFiducial:
 
     @property
     def strategy(self) -> Strategy:
-        return STRATEGIES[self.arguments.strategy]
+        chosen = self.arguments.strategy
+        return chosen if isinstance(chosen, Strategy) else STRATEGIES[chosen]
 
     def look(
         self, calibration: Calibration, way: Way, *, number: int, fresh: bool
@@ -101,10 +103,13 @@ class SteeredFiducial:
         error = self.error_mm(estimate)
         if np.linalg.norm(error) > _WORTH_MORE_FRAMES * self.arguments.tolerance_mm:
             return present
-        return frames_that_decide(present, estimate, self.is_sure)
+        return frames_that_decide(present, estimate, self.is_sure, self.arguments.most_frames)
 
     def error_mm(self, estimate: FiducialEstimate) -> NDArray[np.float64]:
         return np.array(self.arguments.target_mm) - estimate.plane_mm
+
+    def parts(self, estimate: FiducialEstimate) -> tuple[PlanPart, ...]:
+        return ()  # the displacement says it all
 
     def probability(self, estimate: FiducialEstimate) -> float:
         """That the fiducial is within the tolerance."""

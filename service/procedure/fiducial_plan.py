@@ -68,6 +68,7 @@ def approach_of(
         gate=gate_of(config),
         strategy=service.strategy,
         seed=seed,
+        most_frames=service.most_slices,
     )
 
 

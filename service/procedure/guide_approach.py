@@ -20,6 +20,7 @@ from service.procedure.guide_geometry import (
     tip_of,
 )
 from service.procedure.guide_looking import GuideLook, look_at_guide, look_at_guide_longer
+from service.procedure.plan import PlanPart
 from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steering import Standing, SteeringArguments, frames_that_decide, steer
 from service.procedure.steps import ProcedureSteps
@@ -105,7 +106,9 @@ class SteeredGuide:
     def look_longer(
         self, seen: GuideLook, estimate: FiducialEstimate
     ) -> ProcedureSteps[GuideLook | None]:
-        wanted = frames_that_decide(seen.frames_of_each, estimate, self.is_sure)
+        wanted = frames_that_decide(
+            seen.frames_of_each, estimate, self.is_sure, self.arguments.most_frames
+        )
         if wanted <= seen.frames_of_each:
             return None
         geometry, gate = self.arguments.geometry, self.arguments.gate
@@ -115,6 +118,21 @@ class SteeredGuide:
         geometry = self.arguments.geometry
         wanted = geometry.tip_from_fiducials @ np.array(self.arguments.target_mm)
         return np.asarray(wanted - tip_of(geometry, estimate)[0])
+
+    def parts(self, estimate: FiducialEstimate) -> tuple[PlanPart, ...]:
+        """Upper fiducial, lower fiducial, and the needle's tip, which hangs from both."""
+        wanted = np.array(self.arguments.target_mm) - estimate.plane_mm
+        covariance = estimate.covariance_mm2
+        tip = self.error_mm(estimate), tip_of(self.arguments.geometry, estimate)[1]
+        of_each = {
+            "upper": (wanted[:2], covariance[:2, :2]),
+            "lower": (wanted[2:], covariance[2:, 2:]),
+            "tip": tip,
+        }
+        return tuple(
+            PlanPart(name, float(off[0]), float(off[1]), float(np.sqrt(np.trace(spread) / 2)))
+            for name, (off, spread) in of_each.items()
+        )
 
     def probability(self, estimate: FiducialEstimate) -> float:
         """That the tip is within the tolerance, and the lower fiducial too: the smaller of both."""

@@ -93,4 +93,5 @@ def guide_approach_of(
         max_iterations=service.max_iterations,
         confirm_moves=service.confirm_moves,
         gate=gate_of(config),
+        most_frames=service.most_slices,
     )

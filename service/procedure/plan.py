@@ -31,11 +31,21 @@ class Travel:
 
 
 @dataclass(frozen=True)
+class PlanPart:
+    """How far one thing is from where it should be, image plane, with its standard deviation."""
+
+    name: str
+    row_mm: float
+    col_mm: float
+    sigma_mm: float
+
+
+@dataclass(frozen=True)
 class Plan:
     """A move that was worked out but not made.
 
     It is void as soon as the robot stands elsewhere than at `from_um`, or a newer measurement than
-    `measurement_id` exists.
+    `measurement_id` exists. parts: with two fiducials, what is off by how much before the move.
     """
 
     plan_id: str
@@ -43,9 +53,13 @@ class Plan:
     from_um: Mapping[str, int]
     setpoints_um: Mapping[str, int]
     displacement_mm: tuple[float, float]
+    parts: tuple[PlanPart, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
-        return asdict(self)
+        value = asdict(self)
+        if not self.parts:  # as plans of one fiducial have always been recorded
+            del value["parts"]
+        return value
 
 
 def plan_move(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from service.procedure.calibration import Calibration, learn_from_move
 from service.procedure.estimate import FiducialEstimate
-from service.procedure.plan import Plan, PlanRefusedError, Travel, plan_move
+from service.procedure.plan import Plan, PlanPart, PlanRefusedError, Travel, plan_move
 from service.procedure.sensing import ProcedureFailedError, ValidationGate, check_prediction, move
 from service.procedure.steps import Answered, AskOperator, MoveTo, ProcedureSteps, ask
 from service.procedure.strategies import Strategy, Way
@@ -23,7 +23,6 @@ from service.procedure.strategies import Strategy, Way
 CONFIRM = "confirm"
 REJECT = "reject"
 _LOOSE_MM = 0.25
-_MOST_FRAMES = 6
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -31,7 +30,7 @@ class SteeringArguments:
     """What every approach is told.
 
     target_mm: in the image plane of the calibration, as the estimate has it. travel_um: lowest and
-    highest setpoint of each axis.
+    highest setpoint of each axis. most_frames: slices at one position at the most.
     """
 
     target_mm: tuple[float, ...]
@@ -41,6 +40,7 @@ class SteeringArguments:
     max_iterations: int
     confirm_moves: bool
     gate: ValidationGate
+    most_frames: int = 6
 
     @property
     def travel(self) -> dict[str, Travel]:
@@ -95,6 +95,9 @@ class Steered(Protocol[LookT]):
 
     def error_mm(self, estimate: FiducialEstimate) -> NDArray[np.float64]:
         """From where it is to where it should be, image plane (row, col)."""
+
+    def parts(self, estimate: FiducialEstimate) -> tuple[PlanPart, ...]:
+        """How far each thing that the operator is told of is from where it should be."""
 
     def is_there(self, calibration: Calibration, way: Way) -> bool:
         """Whether this is the place to puncture, as far as can be said of it."""
@@ -214,7 +217,7 @@ def _plan(steered: Steered[LookT], standing: Standing[LookT]) -> Plan:
     except PlanRefusedError as error:
         raise ProcedureFailedError("target_out_of_reach", str(error)) from error
     row, col = steered.error_mm(calibration.estimate).tolist()
-    return replace(plan, displacement_mm=(row, col))
+    return replace(plan, displacement_mm=(row, col), parts=steered.parts(calibration.estimate))
 
 
 def _ask_to_confirm(name: str, plan: Plan) -> ProcedureSteps[None]:
@@ -255,13 +258,16 @@ def _go(
 
 
 def frames_that_decide(
-    present: int, estimate: FiducialEstimate, is_sure: Callable[[FiducialEstimate], bool]
+    present: int,
+    estimate: FiducialEstimate,
+    is_sure: Callable[[FiducialEstimate], bool],
+    most: int,
 ) -> int:
     """Return how many slices of a fiducial would be enough to be sure, or the present number.
 
     The bound scales as one over their number; the error found so far is taken as the error.
     """
-    for frames in range(present, _MOST_FRAMES + 1):
+    for frames in range(present, most + 1):
         fewer = replace(estimate, covariance_mm2=estimate.covariance_mm2 * (present / frames))
         if is_sure(fewer):
             return frames

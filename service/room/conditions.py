@@ -7,7 +7,7 @@ from service.room.alarms import Condition
 from service.room.prompt import plain_words
 from service.room.state import RoomState
 
-HANGS = "does not get on"
+HANGS = "is not responding"
 
 
 def conditions(state: RoomState) -> list[Condition]:
@@ -17,24 +17,31 @@ def conditions(state: RoomState) -> list[Condition]:
     if not robot.linked:
         found.append(
             Condition(
-                "no_link", "alarm", f"No link to the robot: {robot.problem}", "Check the line."
+                "no_link",
+                "alarm",
+                f"No link to the robot: {robot.problem}",
+                "Check the serial line and the computer in the scanner room.",
             )
         )
     if robot.linked and robot.fault:
-        found.append(Condition("fault", "alarm", f"Motor fault: {robot.fault}", "See the motors."))
+        found.append(
+            Condition(
+                "fault", "alarm", f"Motor fault: {robot.fault}", "Check the motors, then re-arm."
+            )
+        )
     if robot.linked and robot.phase == WorkPhase.EMERGENCY:
         text = f"EMERGENCY ({plain_words(robot.stop_reason)}): the drives are parked"
-        what = "See to patient and needle. Re-arm when it is safe, then measure again."
+        what = "See to the patient and the needle. Re-arm when it is safe, then measure again."
         found.append(Condition("emergency", "alarm", text, what))
     elif robot.linked and robot.stopped:
         text = f"The robot is stopped ({plain_words(robot.stop_reason)})"
         found.append(Condition("stopped", "alarm", text, "Re-arm when it is safe."))
     if robot.linked and not robot.position_certain:
-        text = "The robot's position is not certain"
+        text = "The robot's position is uncertain"
         found.append(Condition("position", "warning", text, "Re-arm, then measure."))
     if state.ready_lost is not None:
         text = f"READY was lost: {state.ready_lost.text}"
-        what = "Say when the needle is out; then start the approach: it measures again."
+        what = "Confirm that the needle is withdrawn, then start the approach: it measures again."
         found.append(Condition("ready_lost", "alarm", text, what))
     for process in state.processes:
         if process.condition == "down" or process.detail == HANGS:
@@ -44,5 +51,5 @@ def conditions(state: RoomState) -> list[Condition]:
             )
     if state.measurement is not None and state.measurement.state == "failed":
         text = f"Measurement failed: {state.measurement.reason}"
-        found.append(Condition("measurement", "warning", text, "Rescan."))
+        found.append(Condition("measurement", "warning", text, "Acquire the slice again."))
     return found

@@ -16,6 +16,7 @@ from service.procedure.fiducial_plan import gate_of
 from service.procedure.plan import Travel
 from service.procedure.registry import latest_calibration
 from service.procedure.start_point import start_point
+from service.room.belief.goal import effective
 from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
@@ -44,6 +45,10 @@ class Room:
     def now(self) -> Now:
         """How things stand beside the record."""
         return now_of(self.config, self.link)
+
+    def settings(self) -> Config:
+        """The room's configuration with what was changed for this case."""
+        return effective(self.config, self.record)
 
     def note(self, kind: str, by: str, body: dict[str, Any]) -> None:
         self.record.append_event(kind, body, source=SOURCE, who=by)

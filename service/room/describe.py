@@ -13,6 +13,9 @@ from case_record.rows import Measurement, SliceRow
 from room_config.load import Config
 from service.procedure.targets import current_entry, current_target
 from service.room.alarms import AlarmBook, Condition
+from service.room.belief.describe import describe_belief
+from service.room.belief.goal import effective, goal_tolerance_mm
+from service.room.belief.state import BeliefState
 from service.room.conditions import HANGS, conditions
 from service.room.context import now_of
 from service.room.describe_measurement import (
@@ -25,7 +28,7 @@ from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
 from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
-from service.room.prompt import is_calibrated, outcome_text, prompt
+from service.room.prompt import is_calibrated, is_punctured, outcome_text, prompt
 from service.room.proposals import ProposalBook
 from service.room.scanner_clock import clock_update
 from service.room.state import (
@@ -69,10 +72,12 @@ class Describer:
         self._processes: list[ProcessState] = []
         self._look_at_s = 0.0
         self._around_id = 0
+        self._believed_at = (-1, -1)
 
     def describe(self, execution: Execution, before: RoomState) -> RoomState:
         """Return the present state; the revision grows only if something else than time changed."""
         config, record, link = self._config, self._record, self._link
+        settings = effective(config, record)
         case = record.case()
         target = current_target(record)
         target_mm = list(target.patient_mm) if target else None
@@ -90,7 +95,7 @@ class Describer:
                 "ready": arrival is not None,
                 "ready_lost": _lost_ready(found),
                 "arrival": arrival,
-                "punctured": found is not None and _punctured(record, found.procedure_id),
+                "punctured": found is not None and is_punctured(record, found.procedure_id),
                 "robot": describe_robot(link, before.robot),
                 "jog_possible": may_start(record, now) is None,
                 "hold": _hold(record),
@@ -101,10 +106,12 @@ class Describer:
                 "calibrated": is_calibrated(config, record),
                 "target_patient_mm": tuple(target_mm) if target_mm else None,
                 "entry_patient_mm": current_entry(record),
-                **_error(config, record, target_mm, now),
+                **_error(settings, record, target_mm, now),
                 "event_id": record.last_event_id(),
                 "processes": self._look_at_processes(),
                 "proposals": self._proposals.update(record),
+                "tolerance_mm": goal_tolerance_mm(settings),
+                "belief": self._believed(before),
             }
         )
         other = _other(record, state.other_fiducial, now)
@@ -123,6 +130,14 @@ class Describer:
             "reconstruction": describe_reconstruction(self._record, before.reconstruction, last),
             "other_fiducial": describe_other_fiducial(self._record, last),
         }
+
+    def _believed(self, before: RoomState) -> BeliefState:
+        """What the system believes; worked out anew when the record has changed."""
+        changes = self._record.change_count()
+        if before.belief is not None and changes == self._believed_at:
+            return before.belief
+        self._believed_at = changes
+        return describe_belief(self._config, self._record)
 
     def _look_at_processes(self) -> list[ProcessState]:
         if time.monotonic() >= self._look_at_s:
@@ -281,8 +296,3 @@ def _timeless(state: RoomState) -> RoomState:
     parts = {name: getattr(state, name) for name in ("measurement", "arrival")}
     younger = {name: part and part.model_copy(update=ageless) for name, part in parts.items()}
     return state.model_copy(update={"at_s": 0.0, "revision": 0, **younger})
-
-
-def _punctured(record: CaseRecord, procedure_id: int) -> bool:
-    puncture = record.last_event("puncture")
-    return puncture is not None and puncture.body["procedure_id"] == procedure_id

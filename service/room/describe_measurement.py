@@ -37,6 +37,7 @@ def describe_measurement(last: Measurement) -> MeasurementState:
         patient_mm=found.get("patient_mm"),
         n_frames=found.get("n_frames", 0),
         snr=found.get("snr"),
+        chi2_per_dof=found.get("chi2_per_dof"),
         has_reconstruction=bool(found.get("reconstruction")),
     )
 

@@ -32,11 +32,13 @@ def _idle_prompt(
     config: Config, record: CaseRecord, status: BridgeStatus, found: Readiness | None
 ) -> str:
     if found is not None and found.ready:
-        return "READY: puncture; then say when the needle is out."
+        if is_punctured(record, found.procedure_id):
+            return "Puncture recorded. Withdraw the needle, then unlock motion."
+        return "READY: make the puncture."
     if status.phase is WorkPhase.EMERGENCY:
-        return "EMERGENCY: the drives are parked. See to patient and needle; then re-arm."
+        return "EMERGENCY: the drives are parked. See to the patient and the needle, then re-arm."
     if status.stopped:
-        return f"Stopped ({plain_words(status.stop_reason)}). Re-arm to go on."
+        return f"Stopped ({plain_words(status.stop_reason)}). Re-arm to continue."
     if found is not None:
         return _after_arrival(found, status)
     if not status.armed:
@@ -54,8 +56,14 @@ def _after_arrival(found: Readiness, status: BridgeStatus) -> str:
     """The guide came to its target, but READY cannot be said, or not any more."""
     if found.lost is None:
         return "Motion is being locked for the needle."
-    first = "Say first when the needle is out. " if status.insertion_locked else ""
+    first = "Confirm first that the needle is withdrawn. " if status.insertion_locked else ""
     return f"READY was lost: measure again. {first}({found.lost.text})"
+
+
+def is_punctured(record: CaseRecord, procedure_id: int) -> bool:
+    """Whether the puncture at the end of this approach was recorded."""
+    puncture = record.last_event("puncture")
+    return puncture is not None and puncture.body["procedure_id"] == procedure_id
 
 
 def is_calibrated(config: Config, record: CaseRecord) -> bool:

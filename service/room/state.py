@@ -9,6 +9,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from room_config.load import Config
+from service.room.belief.state import BeliefState
 from service.room.proposals import ProposalState
 
 
@@ -77,6 +78,7 @@ class MeasurementState(_Frozen):
     patient_mm: tuple[float, float, float] | None = None
     n_frames: int = 0
     snr: float | None = None
+    chi2_per_dof: float | None = None
     has_reconstruction: bool = False
     age_s: float | None = None
     lost: LostState | None = None
@@ -241,6 +243,7 @@ class RoomState(_Frozen):
     arrival_mode: bool = False
     processes: list[ProcessState] = []
     alarms: list[AlarmState] = []
+    belief: BeliefState | None = None
     proposals: list[ProposalState] = []
 
     @classmethod

@@ -43,6 +43,7 @@ from service.web.routes.proposals import proposal_router
 from service.web.routes.record import event_router, measurement_router, slice_router
 from service.web.routes.record_edits import clerk_router
 from service.web.routes.robot import robot_router, stop_router
+from service.web.routes.settings import settings_router
 from service.web.routes.target import target_router
 from service.web.schemas import Health
 
@@ -126,6 +127,7 @@ def create_app(
         document_router(),
         robot_router(orders),
         target_router(orders),
+        settings_router(orders),
         proposal_router(orders),
         procedure_router(orders),
         clerk_router(orders),

@@ -103,6 +103,15 @@ class CaseBody(Ask):
     note: str = Field(default="", max_length=2000)
 
 
+class SettingsBody(Ask):
+    """Strategy and goal of the present case; the room's file bounds them."""
+
+    strategy: str = Field(min_length=1, max_length=32, examples=["adaptive"])
+    tolerance_mm: float = Field(gt=0, le=100, examples=[0.06])
+    confidence: float = Field(gt=0.5, lt=1, examples=[0.95])
+    most_slices: int = Field(ge=1, le=32, examples=[6], description="At one position.")
+
+
 class ClockBody(Ask):
     """A comparison of the two clocks, made now: the room's minus the scanner's."""
 

@@ -22,6 +22,7 @@ from room_config.exit_codes import BAD_INPUT, COULD_NOT, INTERRUPTED
 from service.cli.children import ChildError, quiet_environment
 from service.client import RoomClient
 from simulator.config import parse_virtual_room
+from simulator.demo.attended import attend_room
 from simulator.demo.operator import WHO, DemoFailedError, Operator
 from simulator.demo.room import DemoOptions, DemoRoom, known_faults
 from simulator.demo.screen import DemoScreen, final_table
@@ -52,11 +53,15 @@ def demo(
     ] = False,
     page_port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 0,
     dicom_port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 0,
+    attended: Annotated[
+        bool,
+        typer.Option("--attended", help="You operate the room yourself, on its page."),
+    ] = False,
     tokens: Annotated[
         bool, typer.Option("--tokens", help="Ask for a token, as a room on a network does.")
     ] = False,
 ) -> int:
-    """The whole room, virtual: calibration and punctures, unattended."""
+    """The whole room, virtual: calibration and punctures, unattended or by you on the page."""
     quiet_environment()
     for name in fault or ():
         if name not in known_faults():
@@ -70,9 +75,19 @@ def demo(
     with _signals():
         faults = tuple(fault or ())
         options = DemoOptions(
-            folder, seed, faults, page_port, dicom_port, tokens=tokens, guide=guide
+            folder,
+            seed,
+            faults,
+            page_port,
+            dicom_port,
+            tokens=tokens,
+            guide=guide,
+            attended=attended,
         )
-        code = _run(DemoRoom(options), punctures, leave=exit_, as_json=json_)
+        if attended:
+            code = attend(DemoRoom(options))
+        else:
+            code = _run(DemoRoom(options), punctures, leave=exit_, as_json=json_)
     if case is None and code != COULD_NOT:
         shutil.rmtree(folder, ignore_errors=True)  # what failed may be gone on with
     return code
@@ -116,6 +131,25 @@ def _run(room: DemoRoom, punctures: int, *, leave: bool, as_json: bool) -> int:
     finally:
         if operator is not None:
             operator.close()
+        room.end()
+
+
+def attend(room: DemoRoom) -> int:
+    """Let a person operate the room until Ctrl-C."""
+    screen = DemoScreen(Console(stderr=True), room.folder)
+    try:
+        screen.note("starting the processes of the virtual room")
+        room.start()
+        attend_room(room, screen.note)
+        return 0
+    except _Ended:
+        screen.note("ending")
+        return 0
+    except ChildError as error:
+        screen.note(room.wait_for_standstill())
+        print(f"autospine: {error}", file=sys.stderr)
+        return COULD_NOT
+    finally:
         room.end()
 
 

@@ -33,7 +33,8 @@ _CLOCK_OFFSET_S = 37.2
 class DemoOptions:
     """What the user chose; port 0 means any free one.
 
-    tokens: the room asks for tokens. guide: two fiducials and four axes.
+    tokens: the room asks for tokens. guide: two fiducials and four axes. attended: a person
+    operates it on the page, which asks before every move.
     """
 
     case_dir: Path
@@ -44,6 +45,7 @@ class DemoOptions:
     speed_factor: float = 3.0
     tokens: bool = False
     guide: bool = False
+    attended: bool = False
 
 
 class PortInUseError(Exception):
@@ -73,6 +75,11 @@ class DemoRoom:
     @property
     def truth_file(self) -> Path:
         return self.virtual_dir / "acquisitions.jsonl"
+
+    @property
+    def faults_file(self) -> Path:
+        """Names of the faults that are switched on just now."""
+        return self.virtual_dir / "faults-now"
 
     def start(self) -> None:
         """Start all processes; ChildError if one does not come up. Call `end` in any case."""
@@ -162,6 +169,7 @@ class DemoRoom:
                 "motors_truth_port": self.truth_port,
                 "truth_file": str(self.truth_file),
                 "clock_offset_s": _CLOCK_OFFSET_S,
+                **({"faults_file": str(self.faults_file)} if self.options.attended else {}),
                 **({"token_file": str(self._token_file)} if self.options.tokens else {}),
             },
         }
@@ -190,7 +198,7 @@ class DemoRoom:
             "service": {
                 "port": page_port,
                 "bridge_link": str(line),
-                "confirm_moves": False,
+                "confirm_moves": self.options.attended,
                 # more than the guard and what the prompt delay leaves open of the clock
                 "settle_s": 0.25,
                 "rescan_after_s": 6.0,

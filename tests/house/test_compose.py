@@ -27,18 +27,22 @@ def composed(*profiles: str) -> dict[str, dict]:
     return yaml.safe_load(result.stdout)["services"]
 
 
-def test_the_file_is_valid_and_has_one_service_a_process():
-    always = {name for name, service in composed().items() if not service.get("profiles")}
-    assert always == {"listener", "worker", "service"}
-
-
-def test_bridge_and_virtual_room_are_profiles():
-    profiles = {name: s.get("profiles") for name, s in composed("virtual", "bridge").items()}
-    assert profiles["bridge"] == ["bridge"]
-    assert profiles["virtual-room"] == ["virtual"]
+@pytest.mark.parametrize(
+    ("profile", "services"),
+    [
+        ("control", {"listener", "worker", "service"}),
+        ("bridge", {"bridge"}),
+        ("virtual", {"virtual-room"}),
+    ],
+)
+def test_a_profile_starts_what_it_says_and_nothing_else(profile, services):
+    started = {name for name, s in composed(profile).items() if profile in s.get("profiles", [])}
+    always = {name for name, s in composed(profile).items() if not s.get("profiles")}
+    assert started == services
+    assert always == set()
 
 
 def test_every_container_has_a_health_check_and_a_known_command():
-    for name, service in composed("virtual", "bridge").items():
+    for name, service in composed("control", "virtual", "bridge").items():
         assert service["command"][0] in SUBCOMMANDS, name
         assert service["healthcheck"]["test"], name

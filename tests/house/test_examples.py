@@ -22,3 +22,10 @@ def test_localize_prints_centre_and_sigma_of_the_vials_of_a_real_slice():
     rows = re.findall(r"row ([\d.]+) ± ([\d.]+) px, col ([\d.]+) ± ([\d.]+) px", said)
     assert len(rows) >= 14
     assert all(float(sigma) < 0.2 for row in rows for sigma in row[1::2])
+
+
+def test_a_strategy_of_ones_own_is_tried_beside_the_default():
+    said = run("own_strategy.py")
+    rows = dict(re.findall(r"(\w+): mean true error ([\d.]+) mm", said))
+    assert rows.keys() == {"mine", "adaptive"}
+    assert all(float(error_mm) < 0.2 for error_mm in rows.values())

@@ -94,7 +94,7 @@ def test_a_whole_case_from_calibration_to_the_needle_out_by_clicking(
     button(page, "Record the puncture")
     page.locator("#depth").fill("61.5")
     button(page, "Record the puncture")
-    button(page, "The needle is out: unlock")
+    button(page, "Needle withdrawn – unlock motion")
     expect(page.locator("#chips")).not_to_contain_text("Motion locked", timeout=SLOW_MS)
     events = {event.kind: event for event in client.events()}
     assert events["puncture"].body["insertion_depth_mm"] == 61.5

@@ -172,8 +172,8 @@ def test_a_target_of_before_is_taken_again_by_clicking(
     first, second = patient_mm(state, 55, 60), patient_mm(state, 58, 66)
     client.set_target((first[0], first[1], first[2]), label="the first")
     client.set_target((second[0], second[1], second[2]), label="the second")
-    expect(page.locator("#targets tr", has_text="the second")).to_contain_text("now")
-    page.get_by_role("button", name="Take target the first again").click()
+    expect(page.locator("#targets tr", has_text="the second")).to_contain_text("current")
+    page.get_by_role("button", name="Use again: target the first").click()
     wait_for(client.state, lambda s: s.target_patient_mm == pytest.approx(first))
     client.withdraw_target()
 
@@ -200,7 +200,7 @@ def test_motion_is_locked_for_the_needle_by_hand_and_unlocked(
     page.get_by_role("button", name="Lock motion for the needle").click()
     expect(page.locator("#chips")).to_contain_text("Motion locked")
     expect(page.get_by_role("button", name="xt plus 1 mm")).to_be_disabled()
-    page.get_by_role("button", name="The needle is out: unlock").click()
+    page.get_by_role("button", name="Needle withdrawn – unlock motion").click()
     expect(page.locator("#chips")).not_to_contain_text("Motion locked")
 
 
@@ -236,13 +236,13 @@ def test_the_clocks_are_compared_by_typing_what_the_scanner_shows(
     card = page.locator("#scanner-clock")
     expect(card).to_contain_text("37.2 s ahead")
     page.locator("#scanner-shows").fill("half past ten")
-    page.get_by_role("button", name="It shows this now").click()
-    expect(card).to_contain_text("Type what the scanner's clock shows")
+    page.get_by_role("button", name="Scanner clock reads this now").click()
+    expect(card).to_contain_text("Type what the scanner clock reads")
     # the scanner of the virtual room is 37.2 s ahead
     read_s = time.time()
     shown = page.evaluate("new Date(Date.now() + 37200).toTimeString().slice(0, 8)")
     page.locator("#scanner-shows").fill(shown)
-    page.get_by_role("button", name="It shows this now").click()
+    page.get_by_role("button", name="Scanner clock reads this now").click()
     pressed_s = time.time()
     page.get_by_role("button", name="Use this").click()
     event = wait_for(
@@ -253,7 +253,7 @@ def test_the_clocks_are_compared_by_typing_what_the_scanner_shows(
     assert -37.2 - 0.7 <= event.body["offset_s"] <= -37.2 + 0.7 + pressed_s - read_s
     assert event.body["uncertainty_s"] == 1.0
     expect(card).to_contain_text("by operator")
-    page.get_by_role("button", name="It was set anew: forget this").click()
+    page.get_by_role("button", name="The scanner clock was changed: forget this").click()
     expect(card).to_contain_text("Not compared")
     client.compare_clocks(-37.2, 0.02)
 
@@ -270,7 +270,7 @@ def test_slices_that_will_not_come_are_given_up_where_slices_were_set_aside(
     # the list is drawn anew under the operator's hands; what was typed stays
     client.describe_case("another list")
     expect(page.locator("#events li").first).to_contain_text("another list")
-    page.get_by_role("button", name="Give them up").click()
+    page.get_by_role("button", name="Stop waiting for these slices").click()
     given_up = wait_for(
         lambda: [e for e in client.events(after=before) if e.kind == "slices_given_up"],
         lambda found: found,
@@ -284,13 +284,13 @@ def test_report_and_export_of_this_case_and_of_others_are_a_click_away(
     page: Page, state: RoomState, client: RoomClient, tmp_path: Path
 ) -> None:
     with page.expect_download(timeout=300_000) as waiting:
-        page.get_by_role("link", name="Export it as a zip").click()
+        page.get_by_role("link", name="Export as zip").click()
     path = tmp_path / "case.zip"
     waiting.value.save_as(path)
     with zipfile.ZipFile(path) as archive:
         assert json.loads(archive.read("MANIFEST.json"))["format"] == "autospine-case-export"
     with page.expect_popup() as opening:
-        page.get_by_role("link", name="Report of this case").click()
+        page.get_by_role("link", name="Report", exact=True).click()
     report = opening.value
     expect(report.locator("body")).to_contain_text(client.state().case_uid, timeout=300_000)
     report.close()
@@ -305,7 +305,7 @@ def test_the_card_of_the_parts_counts_what_crosses_the_line(page: Page, state: R
 
     for name in ("Service", "Robot", "Listener", "Worker"):
         expect(page.locator("#parts tr", has_text=name).first).to_contain_text(
-            re.compile("works|linked")
+            re.compile("running|linked")
         )
     sent = page.locator('[data-metric="autospine_link_frames_sent"]')
     first = wait_for(lambda: count(sent), lambda n: n > 10)

@@ -13,6 +13,7 @@ from service.room.commands.procedure import ProcedureCommands
 from service.room.commands.proposals import ProposalCommands
 from service.room.commands.record import RecordCommands
 from service.room.commands.robot import RobotCommands
+from service.room.commands.settings import SettingsCommands
 from service.room.commands.target import TargetCommands
 from service.room.context import Room
 from service.room.ready_keeper import keep_ready
@@ -64,6 +65,7 @@ def _all_of(room: Room, proposals: ProposalCommands) -> tuple[Callable[..., Any]
         record.describe_case,
         record.compare_clocks,
         record.forget_clock,
+        SettingsCommands(room).change_settings,
         proposals.propose,
         proposals.take_proposal,
         proposals.refuse_proposal,

@@ -70,7 +70,7 @@ class ProcedureCommands:
         target = self._target()
         try:
             arguments = approach_of(
-                self._room.config,
+                self._room.settings(),
                 self._room.link.travel_left_um,
                 start,
                 target,
@@ -88,9 +88,10 @@ class ProcedureCommands:
         if entry_mm is None:
             raise ConflictError("no_entry", "Set an entry point first: the needle has a direction.")
         try:
+            settings = self._room.settings()
             arguments = guide_approach_of(
-                self._room.config,
-                guide,
+                settings,
+                settings.service.guide or guide,
                 self._room.travel(),
                 start,
                 entry_mm,

@@ -62,7 +62,7 @@ class TargetCommands:
             start = self._room.start_point(guide=True)
             told = recording_arguments(guide_recording_of(self._room.config, guide), start)
             return self._room.begin(GUIDE_RECORDING, {**told, "label": label, "by": by}, by)
-        arguments = recording_of(self._room.config, self._room.seed())
+        arguments = recording_of(self._room.settings(), self._room.seed())
         start = self._room.start_point()
         body = {**recording_arguments(arguments, start), "label": label, "by": by}
         return self._room.begin(RECORDING, body, by)

@@ -1,0 +1,1 @@
+"""What the system believes and by what it judges, as a screen shows it."""
