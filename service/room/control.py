@@ -35,12 +35,12 @@ from service.procedure.targets import ENTRY_SET, TARGET_SET
 from service.room.alarms import Condition
 from service.room.commands.commands import Commands
 from service.room.context import Room
+from service.room.counts.correct import correct_counts
 from service.room.describe import Describer, describe_robot
 from service.room.execution import Execution, ProcedureAbortedError
 from service.room.integrity import doubt_of, doubt_of_arrival
 from service.room.link import RoomLink
 from service.room.readiness import ConflictError
-from service.room.stage_witness import correct_counts
 from service.room.state import RoomState
 from service.room.stop_latch import StopLatch
 from service.room.trouble import RECORD_FAULTS, Trouble, held

@@ -127,7 +127,7 @@ def test_the_first_day_of_a_bench(tmp_path: Path, drives: dict[str, str]):
         assert all(truth_mm[a] == 0 for a in truth_mm if a != "1")
         home = room.direct("home", "xt")
         assert home["state"] == "DONE"
-        assert room.truth_mm()["1"] == pytest.approx(-20.0, abs=0.05)
+        assert room.truth_mm()["1"] == pytest.approx(-19.5, abs=0.05)
         assert room.direct("drives", "on") == {"parked": False}
         assert room.direct("drives", "off") == {"parked": True}
         assert room.direct("stop") == {"stopped": True}

@@ -280,7 +280,7 @@ class Campaign:
             # what homing found is, by definition, where the coordinates begin
             told_um = self.bridge.status().positions_um[name]
             at_um = self.truth_um()[name]
-            assert at_um < -TRAVEL_UM + 100, f"homed in mid travel at {at_um:.0f} um, {self}"
+            assert at_um < -TRAVEL_UM + 700, f"homed in mid travel at {at_um:.0f} um, {self}"
             self.offset_um[name] = at_um - told_um
             self.at_an_end.discard(name)
 

@@ -11,7 +11,7 @@ from service.procedure.calibration import Calibration
 from service.procedure.estimate import FiducialEstimate
 from service.procedure.jacobian import ImageJacobian
 from service.procedure.plane import ImagePlane
-from service.procedure.stage_witness import Look, corrections, is_comparable, look_of
+from service.room.counts.look import Look, corrections, is_comparable, look_of
 
 AXES = ("xt", "yt")
 TURN = np.array([[0.1, -0.99], [0.98, 0.12]])  # mm in the image by mm of each axis

@@ -6,7 +6,7 @@ from case_record.record import CaseRecord
 from robot_bridge.client.client import BridgeError, BridgeStatus
 from service.procedure.calibration import Calibration
 from service.procedure.plan import SAME_PLACE_UM
-from service.procedure.stage_witness import Look, corrections, is_comparable, look_of
+from service.room.counts.look import Look, corrections, is_comparable, look_of
 from service.room.link import RoomLink
 
 STAGE_REFERENCE = "stage_reference"
