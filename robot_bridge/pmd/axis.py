@@ -199,6 +199,9 @@ class PmdAxis(PmdController):
                 if "T" in self.doubts and error_um <= self.jitter_um:
                     break  # a board that knows no target mode
                 raise self.error("stopped", f"left target mode {error_um:.0f} um short")
+            if watch.is_away(error_um):  # a count that was reset in between looks the same
+                yield from self.read_status()
+                yield from self.check_status()
             watch.check(error_um, self.clock())
         yield from self._leave_target_mode()
         yield from self._forget_stored()
@@ -365,12 +368,16 @@ class _ProgressWatch:
         self._resolution_s = 3 * count_um / slowest_um_s
         self._far_um = FAR_TOLERANCES * axis.config.tolerance_um
 
+    def is_away(self, error_um: float) -> bool:
+        return error_um > self._bound_um
+
     def check(self, error_um: float, now_s: float) -> None:
         """Raises AxisFaultError."""
         self._looks += 1
         if error_um < self._best_um:
             self._best_um, self._best_s, self._looks = error_um, now_s, 0
-        if error_um > self._bound_um:
+        if self.is_away(error_um):
+            self._axis.certain = False
             raise self._axis.error("runaway", f"moves away, {error_um:.0f} um from the setpoint")
         far = error_um > self._far_um and self._looks >= LOOKS_MIN
         window_s = (FAR_WINDOW_S if far else STALL_WINDOW_S) + self._resolution_s
