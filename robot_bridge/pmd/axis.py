@@ -38,6 +38,7 @@ SETTLE_S = 0.025
 # at once; near it the controller may well take its time.
 STALL_WINDOW_S, FAR_WINDOW_S = 0.5, 0.15
 FAR_TOLERANCES, LOOKS_MIN = 10, 4
+STALE_S = 0.12
 RUNAWAY_MARGIN_UM = 100.0
 # Before its first way an encoder has to follow a short run in open loop.
 PROOF_UM = 200.0
@@ -158,6 +159,9 @@ class PmdAxis(PmdController):
         """The limit bit tells of the last motion, so it is only looked at while ours lasts."""
         yield from self.check_status()
         if self.status & Status.EXTERNAL_LIMIT:
+            self.certain = (
+                False  # the travel ends before the switches: the axis is not where it reads
+            )
             raise self.error("external_limit", "a limit switch stopped the motor")
 
     def _go(self, command: Command) -> Steps[None]:
@@ -179,8 +183,20 @@ class PmdAxis(PmdController):
             yield from self._go(pmd_protocol.move_to_count(self.address, target, self.speed_hz))
         except PmdNoValueError:  # no echo: what it does is seen below, and a target is absolute
             self.doubts["T"] = "a motion is not confirmed by an echo"
-        told_near = False
         watch = _ProgressWatch(self, abs(setpoint_um - self.position_um), self.clock())
+        try:
+            yield from self._follow(setpoint_um, watch)
+        except GeneratorExit:  # stopped on the way
+            if watch.is_stale(self.clock()):
+                self.certain = False  # its encoder may just have died
+            raise
+        yield from self._leave_target_mode()
+        yield from self._forget_stored()
+        yield from self.read_position_surely()
+
+    def _follow(self, setpoint_um: int, watch: "_ProgressWatch") -> Steps[None]:
+        """Until it has arrived. Raises AxisFaultError."""
+        told_near = False
         while True:
             yield Pause(POLL_PAUSE_S)
             status = yield from self.read_status()
@@ -191,21 +207,18 @@ class PmdAxis(PmdController):
                 # Merely near is believed when it is told twice: the line has no checksum.
                 near = error_um <= self.config.tolerance_um
                 if error_um <= self.jitter_um or (near and told_near):
-                    break
+                    return
                 told_near = near
             if status & Status.TARGET_LIMIT:
                 raise self.error("target_limit", f"stopped at a limit, {error_um:.0f} um short")
             if not status & (Status.TARGET_MODE | Status.RUNNING):
                 if "T" in self.doubts and error_um <= self.jitter_um:
-                    break  # a board that knows no target mode
+                    return  # a board that knows no target mode
                 raise self.error("stopped", f"left target mode {error_um:.0f} um short")
             if watch.is_away(error_um):  # a count that was reset in between looks the same
                 yield from self.read_status()
                 yield from self.check_status()
             watch.check(error_um, self.clock())
-        yield from self._leave_target_mode()
-        yield from self._forget_stored()
-        yield from self.read_position_surely()
 
     def _leave_target_mode(self) -> Steps[None]:
         try:
@@ -367,6 +380,9 @@ class _ProgressWatch:
         slowest_um_s = MIN_SPEED_HZ * axis.config.step_um_forward
         self._resolution_s = 3 * count_um / slowest_um_s
         self._far_um = FAR_TOLERANCES * axis.config.tolerance_um
+
+    def is_stale(self, now_s: float) -> bool:
+        return now_s - self._best_s > STALE_S
 
     def is_away(self, error_um: float) -> bool:
         return error_um > self._bound_um

@@ -343,6 +343,7 @@ class Campaign:
             plug.bus.faults.drop_replies = 2
 
     def _for_a_while(self, board: EmulatedController, fault: str) -> None:
+        """A dead encoder stays dead for the whole motion: nobody sees one that misses a moment."""
         setattr(board.faults, fault, True)
         self.run(self.rng.uniform(0.1, 1.0))
         self.until_still()
