@@ -163,9 +163,12 @@ class ScannerClock:
                 "it may have been acquired before the scanner's clock was set: scan again, or "
                 "confirm at which hold this acquisition was made"
             )
+        compared = self.by_comparison(slice_, rules)
+        if compared is not None and _ahead_s(slice_, compared, rules) > rules.jump_tolerance_s:
+            return OffsetUnknown(f"it came sooner than the comparison allows: {_WHAT_TO_DO}")
         lows = [
             bounds.low_s
-            for bounds in (self.by_comparison(slice_, rules), self._by_promptness(slice_, rules))
+            for bounds in (compared, self._by_promptness(slice_, rules))
             if bounds is not None
         ]
         if not lows:
@@ -176,6 +179,26 @@ class ScannerClock:
         compared = self.by_comparison(slice_, rules)
         upper_s = slice_.most_lag_s if self.upper_s is None else self.upper_s
         return upper_s if compared is None else min(upper_s, compared.high_s)
+
+    def wrong_duration(self, slice_: Received, rules: ClockRules) -> str:
+        """Why its end cannot be true though its start may be; empty where nothing says so.
+
+        A short acquisition that ends after it was received may as well show a clock set forward.
+        """
+        interval = slice_.interval
+        if interval.end_s is None or interval.estimated:
+            return ""
+        length_s = interval.end_s - interval.start_s
+        known = self.by_comparison(slice_, rules)
+        if known is None or not length_s > rules.longest_acquisition_s:
+            return ""
+        since_start_s = slice_.received_s - interval.start_s - known.low_s
+        if not -rules.jump_tolerance_s <= since_start_s < length_s - rules.jump_tolerance_s:
+            return ""
+        return (
+            f"its duration of {length_s:.1f} s is wrong: it was here {max(0.0, since_start_s):.1f}"
+            " s after its start"
+        )
 
     def by_comparison(self, slice_: Received, rules: ClockRules) -> OffsetBounds | None:
         """What the comparison says that was made nearest to this slice in time."""
@@ -238,7 +261,7 @@ def observe(clock: ScannerClock, slice_: Received, rules: ClockRules) -> Observa
     A lag below what is believed is impossible unless the scanner's clock was set forward, or what
     is believed was wrong: nothing is assigned by it until somebody has compared the clocks again.
     """
-    duration = wrong_duration(slice_, clock.bounds_for(slice_, rules), rules)
+    duration = clock.wrong_duration(slice_, rules)
     if duration:
         return Observation(clock, duration=duration)
     jump = _contradiction(clock, slice_, rules)
@@ -252,32 +275,11 @@ def observe(clock: ScannerClock, slice_: Received, rules: ClockRules) -> Observa
     return Observation(seen, jump or sooner, late, _unlike_measured(clock, slice_, rules))
 
 
-def wrong_duration(slice_: Received, offset: Offset, rules: ClockRules) -> str:
-    """Why its end cannot be true though its start may be; empty where nothing says so.
-
-    A short acquisition that ends after it was received may as well show a clock set forward.
-    """
-    interval = slice_.interval
-    if isinstance(offset, OffsetUnknown) or interval.end_s is None or interval.estimated:
-        return ""
-    length_s = interval.end_s - interval.start_s
-    if not length_s > rules.longest_acquisition_s:
-        return ""
-    since_start_s = slice_.received_s - interval.start_s - offset.low_s
-    if not -rules.jump_tolerance_s <= since_start_s < length_s - rules.jump_tolerance_s:
-        return ""
-    return (
-        f"its duration of {length_s:.1f} s is wrong: it was here {max(0.0, since_start_s):.1f} s "
-        "after its start"
-    )
-
-
 def _contradiction(clock: ScannerClock, slice_: Received, rules: ClockRules) -> str:
     lag_s = slice_.most_lag_s
     compared = clock.by_comparison(slice_, rules)
     if compared is not None:
-        least_s = 0.0 if rules.promptness is None else rules.promptness.least_s
-        ahead_s = compared.low_s + least_s - lag_s
+        ahead_s = _ahead_s(slice_, compared, rules)
         if ahead_s > rules.jump_tolerance_s:
             return (
                 f"the scanner's clock is at least {ahead_s:.1f} s ahead of the comparison"
@@ -289,6 +291,12 @@ def _contradiction(clock: ScannerClock, slice_: Received, rules: ClockRules) -> 
         if ahead_s > rules.jump_tolerance_s:
             return f"the scanner's clock is at least {ahead_s:.1f} s ahead of before"
     return ""
+
+
+def _ahead_s(slice_: Received, compared: OffsetBounds, rules: ClockRules) -> float:
+    """By how much the scanner's clock must have been ahead of the comparison, if above 0."""
+    least_s = 0.0 if rules.promptness is None else rules.promptness.least_s
+    return compared.low_s + least_s - slice_.most_lag_s
 
 
 def _of_a_zone(ahead_s: float) -> str:

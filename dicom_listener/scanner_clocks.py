@@ -12,7 +12,6 @@ from dicom_listener.clock import (
     Received,
     ScannerClock,
     observe,
-    wrong_duration,
 )
 from dicom_slice.header import Slice
 
@@ -87,7 +86,7 @@ class ScannerClocks:
         received = _received(slice_, received_s)
         if received is None:
             return ""
-        return wrong_duration(received, self.offset(slice_, received_s), self._rules)
+        return self._clock(slice_.scanner).wrong_duration(received, self._rules)
 
     def heed(self, kind: str, body: Mapping[str, Any], wall_s: float) -> None:
         """Follow an event of the record, where it concerns clocks."""

@@ -36,6 +36,10 @@ SUBCOMMANDS: dict[str, tuple[str, str]] = {
     "replay": ("service.cli.replay:app", "Go through a recorded case, also with another method."),
     "export": ("service.cli.export:app", "A case as one zip: DICOM, JSON lines, images."),
     "report": ("service.cli.report:app", "A case as one page: images, table, plots."),
+    "commission": (
+        "service.cli.commission:app",
+        "Measure with a phantom what a site must know: clock, promptness, imaging.",
+    ),
     "check-config": ("service.cli.check_config:app", "Check a room's configuration."),
 }
 

@@ -348,6 +348,24 @@ def test_a_slice_that_comes_much_sooner_than_all_before_it_is_suspicious():
     assert agreed.bounds_for(sooner, RULES).low_s == pytest.approx(-0.1, abs=0.1)
 
 
+def test_a_wrong_duration_is_called_one_and_takes_nothing_from_the_clock():
+    """Two seconds that were written as 2000, by a vendor who writes milliseconds."""
+    clock = compared(0.0)
+    odd = Received(acquired(1010.0, 2000.0), 1012.5)
+    seen = observe(clock, odd, RULES)
+    assert seen.duration == "its duration of 2000.0 s is wrong: it was here 2.6 s after its start"
+    assert (seen.jump, seen.clock) == ("", clock)
+
+
+def test_a_comparison_does_not_hold_for_a_slice_that_came_sooner_than_it_allows():
+    """Held up, and then the clock was set back, and then somebody compared it."""
+    clock = after(ScannerClock(), Received(acquired(1000.0), 1070.0))
+    later = clock.compared(Comparison(676.0, 0.1, 1080.0), RULES)
+    unknown = later.bounds_for(Received(acquired(1000.0), 1070.0), RULES)
+    assert isinstance(unknown, OffsetUnknown)
+    assert "sooner than the comparison allows" in unknown.text
+
+
 def test_a_clock_set_back_is_an_alarm_once_it_seems_too_late():
     clock = after(compared(0.0), Received(acquired(1000.0), 1003.0))
     assert not observe(clock, Received(acquired(1000.0), 1100.0), RULES).late

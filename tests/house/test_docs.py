@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+from real_slices import DICOM, IS_LARGE_SET
 
 from room_config.load import load_config
 
@@ -60,3 +61,12 @@ def test_the_distribution_carries_every_package():
     packages = set(table["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"])
     on_disk = {p.parent.name for p in ROOT.glob("[a-z]*/__init__.py")} - {"tests", "benchmarks"}
     assert packages == on_disk
+
+
+@pytest.mark.skipif(not IS_LARGE_SET, reason="made from the large set of real slices")
+def test_the_page_of_vendors_is_what_the_real_files_give():
+    spec = importlib.util.spec_from_file_location("make_vendors", ROOT / "docs" / "make_vendors.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    page = (ROOT / "docs" / "vendors.md").read_text()
+    assert page == module.render(DICOM), "run: python docs/make_vendors.py"

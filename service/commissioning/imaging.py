@@ -1,0 +1,167 @@
+"""What the slices of a phantom with the fiducial say: point spread, noise, size, oil and water."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from dicom_listener.slice_rows import header_for_record
+from room_config.imaging import ImagingConfig
+from service.commissioning.evidence import CommissioningError, Reception, ScannedSeries
+from service.procedure.targets import TargetError, oil_shift_mm
+from sr_engine.errors import EngineError
+from sr_engine.localization import Localization
+from sr_engine.localize import localize
+from sr_engine.psf import Psf
+from sr_engine.recognise import psf_of_noise
+
+LEAST_AGREEMENT = 0.6
+_SURE_SIGMA = 5.0
+
+
+@dataclass(frozen=True, eq=False)
+class ImagingFinding:
+    """Of the slices with the usual readout.
+
+    psf None: the slices do not agree on one. agreement: share of them that say so. sigma_px: what
+    one localization says of itself, scatter_px: what they scatter by. distortion_corrected None:
+    the header does not say. polarity 0: not known; oil_shift_px: half of what the oil moved by
+    along the readout when its sign was changed, ± oil_sigma_px.
+    """
+
+    psf: Psf | None
+    agreement: float
+    snr: float
+    noise: float
+    radius_mm: float
+    radius_sd_mm: float
+    chi2_per_dof: float
+    sigma_px: float
+    scatter_px: float
+    spacing_mm: tuple[float, float]
+    distortion_corrected: bool | None
+    polarity: int
+    oil_shift_px: float
+    oil_sigma_px: float
+    oil_expected_px: float
+
+
+def find_imaging(series: Sequence[ScannedSeries], imaging: ImagingConfig) -> ImagingFinding:
+    """Judge the pixels. Raises CommissioningError where the fiducial is not seen."""
+    usual = [r for s in series if not s.reversed_readout for r in s.receptions]
+    changed = [r for s in series if s.reversed_readout for r in s.receptions]
+    psf, agreement = _point_spread(usual)
+    found = [_fiducial(reception, imaging, psf) for reception in usual]
+    centres = np.array([one.centre_px for one in found])
+    header = usual[0].header
+    if header.geometry is None:
+        raise CommissioningError(f"the slices have no geometry: {header.geometry_problem}")
+    spacing_mm = header.geometry.spacing_mm
+    radii_mm = np.array([one.radius_px for one in found]) * float(np.mean(spacing_mm))
+    polarity, shift_px, shift_sigma_px, expected_px = _oil(usual, changed, found, imaging, psf)
+    return ImagingFinding(
+        psf=psf,
+        agreement=agreement,
+        snr=float(np.median([one.snr for one in found])),
+        noise=float(np.median([_signal(r, f) / f.snr for r, f in zip(usual, found, strict=True)])),
+        radius_mm=float(radii_mm.mean()),
+        radius_sd_mm=float(radii_mm.std(ddof=1)) if len(radii_mm) > 1 else float("nan"),
+        chi2_per_dof=float(np.median([one.chi2_per_dof for one in found])),
+        sigma_px=float(np.sqrt(np.mean([np.mean(np.diag(one.covariance_px2)) for one in found]))),
+        scatter_px=float(np.sqrt(np.mean(centres.var(axis=0, ddof=1)))),
+        spacing_mm=spacing_mm,
+        distortion_corrected=header.distortion_corrected,
+        polarity=polarity,
+        oil_shift_px=shift_px,
+        oil_sigma_px=shift_sigma_px,
+        oil_expected_px=expected_px,
+    )
+
+
+def _point_spread(receptions: Sequence[Reception]) -> tuple[Psf | None, float]:
+    """What most of the slices show in their noise, and how many of them."""
+    votes = Counter(psf_of_noise(reception.pixels) for reception in receptions)
+    psf, count = votes.most_common(1)[0]
+    agreement = count / len(receptions)
+    return (psf if agreement >= LEAST_AGREEMENT else None), agreement
+
+
+def _fiducial(reception: Reception, imaging: ImagingConfig, psf: Psf | None) -> Localization:
+    geometry = reception.header.geometry
+    spacing_mm = 1.0 if geometry is None else float(np.mean(geometry.spacing_mm))
+    radii = (
+        imaging.fiducial_radius_min_mm / spacing_mm,
+        imaging.fiducial_radius_max_mm / spacing_mm,
+    )
+    try:
+        start_px = _start(reception.pixels, imaging, radii)
+        return localize(reception.pixels, start_px=start_px, radius_px=radii, psf=psf)
+    except EngineError as error:
+        raise CommissioningError(f"the fiducial is not seen in a slice: {error}") from None
+
+
+def _start(
+    pixels: NDArray[np.float64], imaging: ImagingConfig, radii: tuple[float, float]
+) -> NDArray[np.float64] | None:
+    """The one round object of the region in which the room looks for it; None: the whole slice."""
+    if imaging.start_region_px is None:
+        return None
+    r0, c0, r1, c1 = (round(value) for value in imaging.start_region_px)
+    found = localize(pixels[r0 : r1 + 1, c0 : c1 + 1], radius_px=radii)
+    return np.asarray(found.centre_px) + np.array([r0, c0])
+
+
+def _signal(reception: Reception, found: Localization) -> float:
+    """What the slice shows in the middle of the fiducial, stored units."""
+    row, col = np.rint(found.centre_px).astype(int).tolist()
+    return float(reception.pixels[row, col])
+
+
+def _oil(
+    usual: Sequence[Reception],
+    changed: Sequence[Reception],
+    found: Sequence[Localization],
+    imaging: ImagingConfig,
+    psf: Psf | None,
+) -> tuple[int, float, float, float]:
+    """(polarity, shift, its sigma, what the header lets expect), px along the readout."""
+    along, expected_px = _expected(usual[0])
+    if not changed or along is None:
+        return 0, float("nan"), float("nan"), expected_px
+    others = [_fiducial(reception, imaging, psf) for reception in changed]
+    moved = _mean(found) - _mean(others)
+    shift_px = float(moved @ along) / 2
+    sigma_px = float(np.hypot(_sigma(found, along), _sigma(others, along))) / 2
+    if not abs(shift_px) > _SURE_SIGMA * sigma_px:
+        return 0, shift_px, sigma_px, expected_px
+    return (1 if shift_px > 0 else -1), shift_px, sigma_px, expected_px
+
+
+def _expected(reception: Reception) -> tuple[NDArray[np.float64] | None, float]:
+    """(unit vector (row, col) of growing indices along the readout, shift in px)."""
+    geometry = reception.header.geometry
+    if geometry is None:
+        return None, float("nan")
+    try:
+        shift_mm = oil_shift_mm(header_for_record(reception.header), geometry.spacing_mm, 1)
+    except TargetError:
+        return None, float("nan")
+    shift_px = np.asarray(shift_mm, dtype=float) / np.asarray(geometry.spacing_mm)
+    size_px = float(np.linalg.norm(shift_px))
+    return (None, size_px) if not size_px > 0 else (shift_px / size_px, size_px)
+
+
+def _mean(found: Sequence[Localization]) -> NDArray[np.float64]:
+    return np.asarray(np.mean([one.centre_px for one in found], axis=0))
+
+
+def _sigma(found: Sequence[Localization], along: NDArray[np.float64]) -> float:
+    """Of the mean, from the scatter: whatever moves the centre from slice to slice is in it."""
+    values = [float(one.centre_px @ along) for one in found]
+    if len(values) < 2:
+        return float(np.sqrt(along @ found[0].covariance_px2 @ along))
+    return float(np.std(values, ddof=1) / np.sqrt(len(values)))
