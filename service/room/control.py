@@ -23,17 +23,20 @@ from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Procedure
 from room_config.load import Config
 from service.procedure.approach import Arrival
+from service.procedure.calibration import Calibration
 from service.procedure.guide_approach import GuideArrival
 from service.procedure.guide_recording import GuidePlace
 from service.procedure.recording import Place
 from service.procedure.registry import build_procedure, result_to_json
 from service.procedure.runner import ReplayMismatchError, run_procedure
+from service.procedure.scan_frame import frame_of
 from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steps import Outcome, Step
 from service.procedure.targets import ENTRY_SET, TARGET_SET
 from service.room.alarms import Condition
 from service.room.commands.commands import Commands
 from service.room.context import Room
+from service.room.counts.correct import correct_counts
 from service.room.describe import Describer, describe_robot
 from service.room.execution import Execution, ProcedureAbortedError
 from service.room.integrity import doubt_of, doubt_of_arrival
@@ -269,7 +272,9 @@ class ControlLoop:
             raise  # the procedure stays `running`: the next start goes on with it
         except ProcedureAbortedError as error:
             self._end_procedure(running, "aborted", str(error))
-        except (ProcedureFailedError, ReplayMismatchError) as error:
+        except ProcedureFailedError as error:
+            self._end_procedure(running, "failed", str(error), error.code)
+        except ReplayMismatchError as error:
             self._end_procedure(running, "failed", str(error))
         except RECORD_FAULTS as error:
             # the record could be written in between, and yet: then it is not the record's fault
@@ -295,10 +300,11 @@ class ControlLoop:
         text = f"the program failed ({type(error).__name__}: {error}); its log says where"
         self._end_procedure(running, "failed", text)
 
-    def _end_procedure(self, running: Procedure, state: str, reason: str) -> None:
+    def _end_procedure(self, running: Procedure, state: str, reason: str, code: str = "") -> None:
         body = {"procedure_id": running.procedure_id, "name": running.name, "reason": reason}
+        result = {"reason": reason, "code": code}
         with self._record.transaction():
-            self._record.end_procedure(running.procedure_id, state, {"reason": reason})
+            self._record.end_procedure(running.procedure_id, state, result)
             self._record.append_event(f"procedure_{state}", body, source="service")
 
     def _finish_procedure(self, running: Procedure, result: Any) -> None:
@@ -312,6 +318,9 @@ class ControlLoop:
             if isinstance(result, Place | GuidePlace):
                 self._make_target(running, result)
             self._record.append_event("procedure_done", body, source="service")
+        known = getattr(result, "calibration", result)
+        if isinstance(known, Calibration):
+            correct_counts(self._record, self._link, known)
 
     def _make_target(self, recorded: Procedure, place: Place | GuidePlace) -> None:
         """The place that was recorded is the target from now on; a needle's line has an entry."""
@@ -330,6 +339,9 @@ class ControlLoop:
             "procedure_id": recorded.procedure_id,
             "sigma_mm": place.to_json()["sigma_mm"],
         }
+        frame = frame_of(self._record, self._record.measurement(place.calibration.measurement_id))
+        if frame is not None:
+            body["scan_frame"] = frame.to_json()
         self._record.append_event(TARGET_SET, body, source="service", who=who)
 
     def _tick(self) -> None:
