@@ -78,6 +78,9 @@ class Measurements(Connection):
         )
         return [_measurement(row) for row in rows]
 
+    def count_measurements(self) -> int:
+        return int(self._db.execute("SELECT COUNT(*) FROM measurement").fetchone()[0])
+
     def page_of_measurements(self, *, after_id: int, limit: int, newest: bool) -> list[Measurement]:
         """Return measurements in pages by id: upwards from `after_id`, or the newest ones first."""
         order = "DESC" if newest else "ASC"

@@ -37,7 +37,7 @@ class Presence:
         folder = case_dir / FOLDER
         folder.mkdir(parents=True, exist_ok=True, mode=0o700)
         self._file = os.open(folder / name, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
-        # shared: two workers are allowed, and whoever looks asks for the exclusive lock
+        # shared: whoever looks asks for the exclusive lock
         fcntl.flock(self._file, fcntl.LOCK_SH)
         self._next_s = 0.0
         self.beat()

@@ -3,7 +3,7 @@
 import sqlite3
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +22,8 @@ from dicom_listener.holding_area import INBOX
 from dicom_listener.inbox import Inbox
 from dicom_listener.intake import IntakeRules
 from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.network.commitment import Commitment, KeptInstances
+from dicom_listener.network.drop_folder import DropFolder
 from dicom_listener.reception import Reception
 from dicom_listener.retention import remove_old
 from dicom_listener.scp import Scp, ScpRules, tls_context
@@ -132,6 +134,7 @@ def open_scp(
     inbox: Inbox,
     metrics: ListenerMetrics,
     on_stored: Callable[[Path], None],
+    commitment: Commitment | None = None,
 ) -> Scp:
     """The service, bound to its port. Raises ConfigError where port, list or key is no good."""
     tls = None
@@ -141,12 +144,27 @@ def open_scp(
         except OSError as error:
             raise ConfigError(f"listener.tls_*: certificates cannot be used ({error})") from None
     try:
-        return Scp(scp_rules(config), inbox, metrics, on_stored, tls)
+        return Scp(scp_rules(config), inbox, metrics, on_stored, tls, commitment)
     except ValueError as error:
         raise ConfigError(f"listener: {error}") from None
     except OSError as error:
         where = f"{config.host}:{config.port}"
         raise PortError(f"listener.port: cannot listen on {where} ({error.strerror})") from None
+
+
+def _commitment(config: ListenerConfig, cases: Cases) -> Commitment | None:
+    """None where files are removed after a while: what is not kept is not promised."""
+    if config.retention_days:
+        return None
+
+    def folders() -> list[Path]:
+        return [inbox_folder(home) for home in {cases.home, *cases.folders()}]
+
+    places = {
+        title: (place.rpartition(":")[0], int(place.rpartition(":")[2]))
+        for title, place in config.commitment_reports_to.items()
+    }
+    return Commitment(KeptInstances(folders), config.ae_title, places)
 
 
 def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]) -> None:
@@ -163,7 +181,8 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             min_free_bytes=config.listener.min_free_mib * _MIB,
         )
         rules = intake_rules(config)
-        scp = open_scp(config.listener, inbox, metrics, received.put)
+        commitment = _commitment(config.listener, cases)
+        scp = open_scp(config.listener, inbox, metrics, received.put, commitment)
         stack.callback(scp.stop)
         discarded = inbox.discard_unfinished()
         metrics.show("associations_open", "Open associations", lambda: scp.open_associations)
@@ -174,6 +193,18 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
             metrics_port, stop_metrics = metrics.serve(config.listener.metrics_port)
             stack.callback(stop_metrics)
         scp.start()
+        ways_in: list[Scp | DropFolder] = [scp]
+        if config.listener.watch_dir is not None:
+            drop_folder = DropFolder(
+                config.listener.watch_dir,
+                cases.home / "watch_dir.taken",
+                inbox,
+                received.put,
+                max_object_bytes=config.listener.max_object_mib * _MIB,
+            )
+            stack.callback(drop_folder.stop)
+            drop_folder.start()
+            ways_in.append(drop_folder)
         on_ready(Ready(scp.port, metrics_port, config.listener.ae_title))
         # Receiving needs no memory of the case: a long record must not keep a scanner waiting.
         reception = Reception(cases, inbox, rules, metrics)
@@ -187,12 +218,13 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         retention_s = config.listener.retention_days * 86400
         tending = Tending(inbox, reception, retention_s)
         attempts = stack.enter_context(Attempts(cases.home, "listener"))
-        _loop(reception, scp, tending, received, stop, presence, attempts)
+        _loop(reception, scp, ways_in, tending, received, stop, presence, attempts)
 
 
 def _loop(
     reception: Reception,
     scp: Scp,
+    ways_in: Sequence[Scp | DropFolder],
     tending: "Tending",
     received: "SimpleQueue[Path]",
     stop: threading.Event,
@@ -208,8 +240,9 @@ def _loop(
                 _requeue(reception, received)
             _take_received(reception, received, attempts)
             reception.turn()
-            while scp.alarms:
-                reception.note_alarm(*scp.alarms.popleft())
+            for way_in in ways_in:
+                while way_in.alarms:
+                    reception.note_alarm(*way_in.alarms.popleft())
             tending.turn()
         except (CaseRecordError, sqlite3.Error, OSError) as error:
             # The slices are safe in the inbox: tried again until the record can be written.

@@ -20,6 +20,7 @@ from pydicom.dataset import Dataset
 from pynetdicom import AE, _config, evt
 from pynetdicom.association import Association
 from pynetdicom.events import Event
+from pynetdicom.sop_class import StorageCommitmentPushModel
 
 from dicom_listener import inbox as inbox_module
 from dicom_listener.inbox import Envelope, Inbox, InboxError, sha256_of
@@ -32,6 +33,7 @@ from dicom_listener.negotiation import (
     rejection_text,
     report_of,
 )
+from dicom_listener.network.commitment import Commitment
 from dicom_listener.network.endings import ending_of
 from dicom_listener.network.store_request import mend_store_request, uid_sent_under
 from dicom_listener.transport import BoundedSocket, PromptServer
@@ -82,11 +84,13 @@ class Scp:
         metrics: ListenerMetrics,
         on_stored: Callable[[Path], None],
         tls: ssl.SSLContext | None = None,
+        commitment: Commitment | None = None,
     ) -> None:
         self._rules = rules
         self._inbox = inbox
         self._metrics = metrics
         self._on_stored = on_stored
+        self._commitment = commitment
         self._networks = [ipaddress.ip_network(net, strict=False) for net in rules.peer_networks]
         self.reports: deque[NegotiationReport] = deque(maxlen=_REPORTS_KEPT)
         self.alarms: deque[tuple[str, str]] = deque(maxlen=1000)
@@ -104,6 +108,7 @@ class Scp:
                 (evt.EVT_C_STORE, self._on_store),
                 (evt.EVT_DIMSE_RECV, self._on_message),
                 (evt.EVT_SOP_COMMON, self._on_common_extended),
+                (evt.EVT_N_ACTION, self._on_action),
             ],
             server_class=self._server_class(),
         )
@@ -146,6 +151,9 @@ class Scp:
         ae.network_timeout = rules.network_timeout_s
         ae.maximum_pdu_size = rules.negotiated_pdu_bytes
         add_contexts(ae, any_storage_class=rules.any_storage_class)
+        if self._commitment is not None:
+            self._commitment.on_unreported = lambda text: self._alarm("commitment_unreported", text)
+            ae.add_supported_context(StorageCommitmentPushModel, scu_role=True, scp_role=True)
         return ae
 
     def _server_class(self) -> type[PromptServer]:
@@ -275,6 +283,15 @@ class Scp:
         self._metrics.echoes.inc()
         event.assoc.dul.socket.message_done()
         return SUCCESS
+
+    def _on_action(self, event: Event) -> tuple[int, None]:
+        event.assoc.dul.socket.message_done()
+        if self._commitment is None:
+            return CANNOT_UNDERSTAND, None
+        asked = event.action_information
+        status = self._commitment.answer(event.assoc, event.action_type, asked)
+        self._metrics.commitments.labels(f"{status:04X}").inc()
+        return status, None
 
     def _on_store(self, event: Event) -> Dataset | int:
         began_s = event.assoc.dul.socket.message_done()

@@ -47,6 +47,11 @@ class ListenerConfig(Section):
     tls_authority: Path | None = Field(
         default=None, description="PEM file of the authority that signs the senders' certificates."
     )
+    watch_dir: Path | None = Field(
+        default=None,
+        description="A folder (share) to which the scanner's console writes slices: a second way "
+        "in. It is only read.",
+    )
     scanner_time_zone: str = Field(
         default="",
         description="IANA name of the zone of scanners that do not say; empty: this computer's.",
@@ -108,6 +113,11 @@ class ListenerConfig(Section):
     metrics_port: int | None = Field(
         default=None, ge=0, le=65535, description="Serve /metrics on localhost; absent: do not."
     )
+    commitment_reports_to: dict[str, str] = Field(
+        default={},
+        description='AE title = "host:port" of consoles that ask for Storage Commitment and want '
+        "the report on an association of its own.",
+    )
     retention_days: float = Field(
         default=0.0, ge=0, description="Remove set-aside files after so many days; 0: keep all."
     )
@@ -118,6 +128,14 @@ class ListenerConfig(Section):
             raise ValueError("least_delay_s is measured with prompt_delay_s: give both")
         if self.prompt_delay_s is not None and not self.least_delay_s <= self.prompt_delay_s:
             raise ValueError("least_delay_s must not be more than prompt_delay_s")
+        return self
+
+    @model_validator(mode="after")
+    def _reports_have_addresses(self) -> "ListenerConfig":
+        for title, place in self.commitment_reports_to.items():
+            host, _, port = place.rpartition(":")
+            if not host or not port.isdecimal() or not 0 < int(port) < 65536:
+                raise ValueError(f"commitment_reports_to {title}: {place!r} is not host:port")
         return self
 
     @model_validator(mode="after")

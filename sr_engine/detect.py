@@ -26,6 +26,7 @@ LARGE_PX = 5.5  # from here on LEAST_EXPLAINED is enough
 LEAST_SIGNIFICANCE = 100.0
 LEAST_COVERAGE = 0.8
 LEAST_SHARPNESS = 0.08  # of the edge's profile, not explained by a straight slope
+SOFT_REACHES_PX, MOST_REACH = (4.5, 6.0), 0.8  # px, of the radius: bands of a soft edge's profile
 LEAST_CONTRAST = 4.0  # of the edge, over the noise of a sector of it
 LEAST_GREY_STEPS = 4.0  # of the edge: the corners of one or two levels are round by chance
 MOST_OUT_OF_ROUND_PX, MOST_OUT_OF_ROUND = 0.4, 0.02  # px, or of the radius if that is more
@@ -180,6 +181,15 @@ def _is_known(match: Match, found: list[Candidate]) -> bool:
     return False
 
 
+def _sharpness(image: Array, centre: tuple[float, float], radius: float, seen: float) -> float:
+    """Of the edge over as wide a band as it is soft: a filtered, zero-filled edge takes 4 to 6 px.
+
+    Never wider than most of the radius: over a small part of it the hill of a coil stays straight.
+    """
+    reaches = [r for r in SOFT_REACHES_PX if r <= MOST_REACH * radius]
+    return max([seen, *(roundness(image, centre, radius, r).sharpness for r in reaches)])
+
+
 def _verified(image: Array, match: Match, least_contrast: float) -> Candidate | None:
     """The candidate with its circle drawn through its edge, if that is round and sharp."""
     centre, radius = match.centre_px, match.radius_px
@@ -194,7 +204,7 @@ def _verified(image: Array, match: Match, least_contrast: float) -> Candidate | 
     )
     real = (
         seen.coverage >= LEAST_COVERAGE
-        and seen.sharpness >= LEAST_SHARPNESS
+        and _sharpness(image, centre, radius, seen.sharpness) >= LEAST_SHARPNESS
         and seen.contrast > LEAST_CONTRAST * seen.noise
         and seen.contrast >= least_contrast
     )

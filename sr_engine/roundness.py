@@ -53,12 +53,17 @@ def out_of_round_px(
     return float(1.4826 * np.median(np.abs(offsets - np.median(offsets))))
 
 
-def roundness(frame: Array, centre_px: tuple[float, float], radius_px: float) -> Roundness:
+def roundness(
+    frame: Array,
+    centre_px: tuple[float, float],
+    radius_px: float,
+    reach_px: float = REACH_PX,
+) -> Roundness:
     """Compare the edge profiles of all directions around a circle (row, col, radius in px).
 
     Directions that leave the frame count as missing.
     """
-    profiles, distance, complete = _profiles(frame, centre_px, radius_px, REACH_PX)
+    profiles, distance, complete = _profiles(frame, centre_px, radius_px, reach_px)
     mean = np.median(profiles, axis=0)
     shape = mean - mean.mean()
     norm = float(np.linalg.norm(shape))

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from case_record.attempts import MOST_DEATHS, Attempts
 from case_record.cases import Cases
 from case_record.connection import json_text
-from case_record.presence import Presence
+from case_record.presence import Presence, Sole
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Measurement, SliceRow
 from dicom_slice.geometry import SliceGeometry
@@ -98,11 +98,12 @@ class PointSpreads:
 def serve(config: Config, should_stop: Callable[[], bool]) -> None:
     """Work until `should_stop` on whatever case is open; says every second: alive.
 
-    While the record cannot be read or written it is tried again: the requests stand in it.
+    While the record cannot be read or written it is tried again: the requests stand in it. Raises
+    CaseRecordError, which names it, where another worker serves this room.
     """
     cases = Cases(*config.room.folders)
     psfs = PointSpreads(config.imaging.point_spread)
-    with Presence(cases.home, "worker") as presence:
+    with Sole(cases.home, "worker"), Presence(cases.home, "worker") as presence:
         told_s = 0.0
 
         def alive() -> bool:
@@ -122,6 +123,9 @@ def serve(config: Config, should_stop: Callable[[], bool]) -> None:
                     _work_on(case_dir, cases, config, psfs, alive)
             except (CaseRecordError, sqlite3.Error, OSError) as error:
                 log.error("the case record cannot be used", error=str(error))
+                time.sleep(_RECORD_RETRY_S)
+            except Exception:  # the requests stand in the record: nothing is lost by trying again
+                log.exception("the worker's loop")
                 time.sleep(_RECORD_RETRY_S)
 
 

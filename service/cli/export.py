@@ -49,14 +49,34 @@ def export(
         Path | None, typer.Option(help="The zip to write; by default CASE.zip here.")
     ] = None,
     force: Annotated[bool, typer.Option(help="Replace a file that is there.")] = False,
+    slicer: Annotated[
+        bool, typer.Option("--slicer", help="Write a scene for 3D Slicer (CASE.mrb) instead.")
+    ] = False,
 ) -> None:
-    """Write a case as one zip: DICOM, JSON lines, images."""
-    target = out or Path(f"{case.resolve().name}.zip")
+    """Write a case as one zip: DICOM, JSON lines, images. Or as a scene for 3D Slicer."""
+    target = out or Path(f"{case.resolve().name}.{'mrb' if slicer else 'zip'}")
     if target.exists() and not force:
         raise ExportError(f"{target} is there already (--force replaces it)")
     with CaseRecord(case) as record:
-        members = write_export(record, target)
+        members = (_write_scene if slicer else write_export)(record, target)
     print(f"{target}: {members} files")
+
+
+def _write_scene(record: CaseRecord, target: Path) -> int:
+    """As `write_export`, for 3D Slicer."""
+    from service.cli.slicer_scene import write_scene
+
+    if record.case() is None:
+        raise ExportError(f"{record.case_dir}: no case was begun here")
+    fresh = target.with_name(target.name + ".part")
+    try:
+        members = write_scene(record, fresh, target.stem)
+        os.replace(fresh, target)
+    except OSError as error:
+        raise ExportError(f"{target}: cannot be written ({error.strerror})") from error
+    finally:
+        fresh.unlink(missing_ok=True)
+    return members + 1
 
 
 def write_export(record: CaseRecord, target: Path) -> int:

@@ -27,7 +27,9 @@ from sr_engine.errors import EngineError, NoRoundObjectError
 from sr_engine.localization import Localization
 from sr_engine.localize import localize
 from sr_engine.locate import Located, locate_all
+from sr_engine.recognise import psf_of_noise
 
+RADIUS_SLACK = 0.03  # of the range's ends: what a radius is uncertain by
 METHODS = ("ml", "sr", "bicubic", "base")
 app = typer.Typer(add_completion=False)
 
@@ -61,7 +63,7 @@ def locate(
     if template is not None:
         found, shown, problems = _locate_by_template(path, template, radii_mm, region)
     elif shifts is not None:
-        found, shown, problems = _locate_together(path, shifts, method, radii_mm)
+        found, shown, problems = _locate_together(path, shifts, method, radii_mm, region)
     else:
         found, shown, problems = _locate_each(path, method, radii_mm, region)
     console = Console(stderr=True)
@@ -149,7 +151,7 @@ def _round_objects(
         found = locate_all(pixels, radii_px, roi=bounds)
     else:
         found = _by_the_papers_method(pixels, radii_px, bounds, method)
-    rows = [_row(one, header, [file]) for one in found]
+    rows = [_row(one, header, [file]) for one in _of_size(found, radii_px)]
     return sorted(rows, key=lambda row: (round(row["row"]), row["col"]))
 
 
@@ -173,7 +175,11 @@ def _by_the_papers_method(
 
 
 def _locate_together(
-    paths: Sequence[Path], table: Path, method: str, radii_mm: Sequence[float]
+    paths: Sequence[Path],
+    table: Path,
+    method: str,
+    radii_mm: Sequence[float],
+    region: tuple[int, ...] | None,
 ) -> tuple[Rows, Shown, list[str]]:
     """One object in several slices taken at known shifts."""
     shifts_px = read_shift_table(table)
@@ -195,16 +201,65 @@ def _locate_together(
     spacing = float(np.mean(geometry_of(header, files[0]).spacing_mm))
     try:
         refuse_non_square(geometry_of(header, files[0]).spacing_mm)
+        radii_px = (radii_mm[0] / spacing, radii_mm[1] / spacing)
         one = localize(
             np.array([frame[1] for frame in frames]),
             np.array(shifts),
-            radius_px=(radii_mm[0] / spacing, radii_mm[1] / spacing),
+            start_px=_start_in(region, frames[0][1], shifts[0], radii_px),
+            radius_px=radii_px,
             method=method,
+            psf=psf_of_noise(frames[0][1]) if method == "ml" else None,
         )
+        _refuse_size(one, radii_px)
     except EngineError as error:
         return [], [], [str(error)]
     row = _row(one, header, files)
     return [row], [(frames[0], [row])], []
+
+
+def _start_in(
+    region: tuple[int, ...] | None,
+    first: NDArray[np.float64],
+    shift: tuple[float, float],
+    radii_px: tuple[float, float],
+) -> tuple[float, float] | None:
+    """Where the one round object of the region is in the reference pose; None without a region."""
+    if region is None:
+        return None
+    bounds = (region[0], region[1], region[2], region[3])
+    seen = detect(first, radii_px, roi=bounds, max_objects=2)
+    if not seen:
+        raise NoRoundObjectError("no round object of the allowed size in the region of interest")
+    row, col = seen[0].centre_px
+    return row - shift[0], col - shift[1]
+
+
+def _refuse_size(one: Localization | Located, radii_px: tuple[float, float]) -> None:
+    """Detection takes what is somewhat outside of the range; what is reported is inside."""
+    low, high = (1 - RADIUS_SLACK) * radii_px[0], (1 + RADIUS_SLACK) * radii_px[1]
+    if not low <= one.radius_px <= high:
+        row, col = one.centre_px
+        raise NoRoundObjectError(
+            f"the round object at row {row:.1f}, col {col:.1f} has a radius of about "
+            f"{one.radius_px:.2f} px; {radii_px[0]:.2f} to {radii_px[1]:.2f} px are looked for"
+        )
+
+
+def _of_size(
+    found: Sequence[Localization | Located], radii_px: tuple[float, float]
+) -> list[Localization | Located]:
+    """Those of the wanted size. Raises what is the matter with the only ones there are."""
+    fitting: list[Localization | Located] = []
+    refusal: EngineError | None = None
+    for one in found:
+        try:
+            _refuse_size(one, radii_px)
+            fitting.append(one)
+        except NoRoundObjectError as error:
+            refusal = refusal or error
+    if refusal is not None and not fitting:
+        raise refusal
+    return fitting
 
 
 def _row(one: Localization | Located, header: Slice, files: Sequence[Path]) -> dict[str, Any]:

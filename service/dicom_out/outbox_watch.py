@@ -76,10 +76,13 @@ class OutboxWatch(Collector):
         child = _Child(self._config)
         try:
             while not self._closing.wait(_LOOK_S):
-                child.keep_alive()
-                with contextlib.suppress(sqlite3.Error, OSError):  # looked at again soon
-                    self._look()
-                self._conditions = tuple(self._what_is_wrong(child.problem))
+                try:
+                    child.keep_alive()
+                    with contextlib.suppress(sqlite3.Error, OSError):  # looked at again soon
+                        self._look()
+                    self._conditions = tuple(self._what_is_wrong(child.problem))
+                except Exception:  # the thread must not end: the outbox would not come again
+                    log.exception("outbox watch")
         finally:
             child.end()
 

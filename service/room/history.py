@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import sqlite3
 from bisect import bisect_right
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from case_record.cases import Cases
-from case_record.record import CaseRecord, CaseRecordError
+from case_record.record import FILE_NAME, CaseRecord, CaseRecordError
 from case_record.rows import Measurement
 from service.procedure.estimate import axis_sigma
 from service.procedure.plane import ImagePlane
@@ -97,11 +99,21 @@ def past_cases(cases: Cases) -> list[CaseSummary]:
     summaries = []
     for folder in cases.folders():
         try:
-            with CaseRecord(folder, read_only=True) as record:
-                summaries.append(_summary(record, folder, folder == cases.open))
-        except CaseRecordError:
-            continue  # a record of a newer program, or none: not ours to show
+            at = (folder / FILE_NAME).stat()
+            read = _read_summary if folder == cases.open else _closed_summary
+            summaries.append(read(folder, folder == cases.open, at.st_mtime_ns, at.st_size))
+        except (CaseRecordError, sqlite3.Error, OSError):
+            continue  # a record of a newer program, a damaged one, or none: not ours to show
     return sorted(summaries, key=lambda case: -case.created_s)
+
+
+def _read_summary(folder: Path, current: bool, mtime_ns: int, size: int) -> CaseSummary:
+    with CaseRecord(folder, read_only=True) as record:
+        return _summary(record, folder, current)
+
+
+# hundreds of old cases must not be opened for every look at the list; nobody changes them any more
+_closed_summary = lru_cache(maxsize=10_000)(_read_summary)
 
 
 def _summary(record: CaseRecord, folder: Path, current: bool) -> CaseSummary:
@@ -113,7 +125,7 @@ def _summary(record: CaseRecord, folder: Path, current: bool) -> CaseSummary:
         label=described.body["label"] if described else "",
         created_s=case.created_s if case else 0.0,
         slices=sum(record.count_slices().values()),
-        measurements=len(record.measurements()),
+        measurements=record.count_measurements(),
         punctures=len(record.events_of_kind("puncture")),
         current=current,
     )

@@ -67,7 +67,8 @@ class Broadcast:
                 self._watch_record()
             except Exception as error:  # whatever it is, the screens must go on being told
                 structlog.get_logger().exception("event stream", error=str(error))
-                self._beat_if_due()
+                with contextlib.suppress(Exception):
+                    self._beat_if_due()
                 self._closing.wait(_AGAIN_S)
 
     def _watch_record(self) -> None:

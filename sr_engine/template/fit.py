@@ -1,10 +1,10 @@
 """Fit of an object's own image in one frame: centre, amplitude, background, slopes.
 
 Generalised least squares by Gauss-Newton, with analytic derivatives. What is fitted is the
-expected pixel: of a magnitude the Rician mean of the image, of other pixels the image itself. The
-weights are the variance that pixels of that signal have, and the correlation that the frames show,
-softened; the covariance is that of these weights in the noise as measured (a sandwich), so that it
-holds where the weights are not the best.
+expected pixel: of a magnitude the Rician mean of the image, of other pixels the image itself. All
+pixels weigh alike, but for the correlation that the frames show, softened; the covariance is that
+of these weights in the noise as measured, level by level (a sandwich), so that it holds where the
+weights are not the best.
 """
 
 from dataclasses import dataclass
@@ -37,8 +37,8 @@ class Metric:
     mask (n, n): pixels of the patch that count. kind, sigma: of magnitudes, the noise std per
     channel; scale: by how much their variance is more than that. variances (3,): of other pixels
     in air, at the edge and on the plateau, top being its level. correlation, weights: (p, p) of
-    the p pixels of the mask, None where the noise is white (weights None: not used). flat: all
-    pixels weigh alike, whatever their variance. widened: factor of the covariance.
+    the p pixels of the mask, None where the noise is white (weights None: not used). widened:
+    factor of the covariance.
     """
 
     mask: Mask
@@ -49,7 +49,6 @@ class Metric:
     top: float = 1.0
     correlation: Array | None = None
     weights: Array | None = None
-    flat: bool = False
     widened: float = 1.0
 
     @classmethod
@@ -61,11 +60,6 @@ class Metric:
             return moments(signal, self.sigma, "rician").variance * self.scale
         air, edge, plateau = self.variances
         return np.interp(signal / self.top, _KNOTS, (air, air, edge, plateau))
-
-    def weight(self, variance: Array) -> Array:
-        """(p,) one over the std that each pixel is taken to have."""
-        taken = np.full_like(variance, float(variance.mean())) if self.flat else variance
-        return np.asarray(1 / np.sqrt(taken))
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,7 +173,8 @@ def _settled(values: Array, image: ObjectImage, metric: Metric, start: Array) ->
         amplitude, background, by_row, by_col = parameters[_AMPLITUDE:]
         expected = moments(amplitude * signal, metric.sigma, metric.kind)
         variance = metric.variance(max(amplitude, 0.05) * signal)
-        weight = metric.weight(variance)
+        # alike for all pixels: air is surer, but it is there that a template is least so
+        weight = np.full_like(variance, 1 / np.sqrt(float(variance.mean())))
         slope = expected.slope * weight
         jacobian = np.stack(
             [amplitude * d_row * slope, amplitude * d_col * slope, signal * slope,

@@ -8,11 +8,13 @@ such an image with noise in two channels, by expectation maximisation (the phase
 that of the present image, its expected size y I1(ys/v)/I0(ys/v)). Pixels that are no magnitudes any
 more (smoothed, denoised, combined) are averaged as they are.
 
-Every frequency is drawn to zero as far as its annulus shows no more than noise there.
+Every frequency is drawn to its annulus's own course (of a round object all there is) as far as
+what differs from it shows no more than noise: a round fiducial costs a few numbers, and any other
+shape is not presumed to be round.
 Unit: pixels. Patches are square, of even size n; the object is centred at index n//2.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import scipy.fft
@@ -43,6 +45,12 @@ class ObjectImage:
     @property
     def size(self) -> int:
         return len(self.spectrum)
+
+    def recentred(self, middle_px: Array) -> "ObjectImage":
+        """The same object about another origin, which lies at middle_px from this one."""
+        k = np.fft.fftfreq(self.size)
+        phase = np.exp(2j * np.pi * np.add.outer(k * middle_px[0], k * middle_px[1]))
+        return replace(self, spectrum=self.spectrum * phase)
 
     def at(self, centre_px: Array) -> tuple[Array, Array, Array]:
         """Image (n, n) with the object at centre_px from index n//2; derivatives in row and col."""
@@ -107,7 +115,7 @@ def _leverage(views: Views, kept: Array) -> float:
 
 
 class _Average:
-    """Weighted mean of the views' spectra, drawn to zero where it is no more than noise."""
+    """Weighted mean of the views' spectra, less what is no more than noise."""
 
     def __init__(self, views: Views, channels: int) -> None:
         n = views.patches.shape[1]
@@ -119,20 +127,38 @@ class _Average:
         k = np.abs(np.fft.fftfreq(n, 1 / n))
         self.annuli = np.rint(np.hypot(k[:, None], k[None, :])).astype(int)
         self.counts = np.bincount(self.annuli.ravel())
+        self.round = _radial_basis(np.hypot(k[:, None], k[None, :]).ravel())
 
     def of(self, patches: Complex) -> tuple[Complex, Array]:
         """Spectrum (n, n), and the share of it that is kept at each frequency."""
         rolled = scipy.fft.ifftshift(patches * self.weights, axes=(1, 2))
         mean = np.sum(scipy.fft.fft2(rolled) * self.phases, axis=0) / self.total
+        same_all_round = (self.round @ (self.round.T @ mean.ravel())).reshape(mean.shape)
+        mean = mean - same_all_round
         power = np.bincount(self.annuli.ravel(), (np.abs(mean) ** 2).ravel()) / self.counts
         floor = np.bincount(self.annuli.ravel(), self.noise.ravel()) / self.counts
         object_power = np.maximum(power - floor, _LEAST_POWER * floor)[self.annuli]
         kept = object_power / (object_power + self.noise)
-        return mean * kept, kept
+        return same_all_round + mean * kept, kept
 
     def views_of(self, spectrum: Complex) -> Complex:
         images = scipy.fft.ifft2(spectrum[None] * self.phases.conj())
         return np.asarray(scipy.fft.fftshift(images, axes=(1, 2)))
+
+
+def _radial_basis(k: Array) -> Array:
+    """(n*n, K) orthonormal, smooth functions of the distance from the origin of k-space."""
+    knots = np.arange(int(np.ceil(k.max())) + 2, dtype=float)
+    away = np.abs(k[:, None] - knots)
+    # cubic B-splines, even about the origin
+    values = _cubic(away) + np.where(knots > 0, _cubic(np.abs(k[:, None] + knots)), 0.0)
+    basis, triangle = np.linalg.qr(values)
+    return np.asarray(basis[:, np.abs(np.diag(triangle)) > 1e-6])
+
+
+def _cubic(x: Array) -> Array:
+    near, far = (4 - 6 * x**2 + 3 * x**3) / 6, np.maximum(2 - x, 0.0) ** 3 / 6
+    return np.where(x < 1, near, far)
 
 
 def _maximised(

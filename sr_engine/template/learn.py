@@ -110,13 +110,14 @@ def learn_template(
     found = moving_object(stack, shifts, radius_px, near)
     candidates = [_learnt(stack, found, shifts, kind) for kind in _kinds(stack, found, shifts)]
     best = min(candidates, key=lambda learnt: learnt.misfit)
-    return _checked(best, found, stack, shifts, shift_sigma_px)
+    return _checked(best, best.found, stack, shifts, shift_sigma_px)
 
 
 @dataclass(frozen=True, eq=False)
 class _Learnt:
     image: ObjectImage
     metric: Metric
+    found: Moving  # the object, its origin moved to the middle of its outline
     misfit: float  # mean square of what is left of a frame that the template was not made from
 
 
@@ -174,12 +175,16 @@ def _learnt(stack: Array, found: Moving, shifts: Array, kind: NoiseKind) -> _Lea
         surroundings = surroundings + levels[:, None, None]
     views = Views(patches, offsets, windows, np.ones(count), sigma, np.ones((size, size)))
     metric = Metric.white(mask, kind, sigma)
-    for _ in range(_ROUNDS):
-        views = replace(views, patches=patches - surroundings)
+    for number in range(_ROUNDS):
+        views = replace(views, patches=patches - surroundings, offsets_px=offsets)
         if kind == "rician":
             image = magnitude_image(views, found.radius_px)
         else:
             image = averaged_image(views)
+        if number < _ROUNDS - 1:  # what is round is so about its middle
+            middle, _ = absolute_centre(image, found.radius_px)
+            found = replace(found, centre_px=found.centre_px + middle)
+            offsets, image = offsets + middle, image.recentred(middle)
         signals = np.array([image.at(offset)[0] for offset in offsets])
         top = float(np.percentile(signals[:, mask], 97))
         metric = replace(metric, top=max(top, 1e-12))
@@ -205,7 +210,7 @@ def _learnt(stack: Array, found: Moving, shifts: Array, kind: NoiseKind) -> _Lea
         if kind == "gaussian":
             views = replace(views, sigma=float(np.sqrt(np.mean(metric.variances))))
     left = np.mean(residuals[:, mask] ** 2) / (1 - image.leverage) ** 2
-    return _Learnt(image, metric, float(left))
+    return _Learnt(image, metric, found, float(left))
 
 
 def _measured(
@@ -254,12 +259,9 @@ def _power(table: Array, size: int) -> Array:
 
 
 def _weighings(metric: Metric) -> list[Metric]:
-    """The ways to weigh the pixels: by their variance, alike, and by their correlation too."""
+    """The ways to weigh the pixels: alike, and by their correlation where there is any."""
     plain = replace(metric, weights=None)
-    ways = [plain, replace(plain, flat=True)]
-    if metric.weights is not None:
-        ways += [metric, replace(metric, flat=True)]
-    return ways
+    return [plain] if metric.weights is None else [plain, metric]
 
 
 def _checked(

@@ -66,6 +66,25 @@ def test_a_request_that_the_program_fails_at_fails_alone(record, tmp_path, reque
         worker.communicate()
 
 
+def test_a_second_worker_is_refused_with_who_is_there_and_takes_over_when_that_is_killed(
+    record, tmp_path
+):
+    first = start_worker(tmp_path)
+    wait_for_end(record, record.request_measurement("ml", [1], {}))
+    second = start_worker(tmp_path)
+    assert second.wait(60.0) == 2
+    second.communicate()
+    assert f"another worker (process {first.pid})" in (tmp_path / "worker.log").read_text()
+    first.kill()
+    first.communicate()
+    third = start_worker(tmp_path)
+    try:
+        row = wait_for_end(record, record.request_measurement("ml", [1], {}))
+        assert row.state == "failed"
+    finally:
+        third.communicate()
+
+
 def test_a_request_that_killed_the_worker_twice_is_not_tried_again(record, tmp_path):
     number = record.request_measurement("ml", [1], {"holds": []})
     for _ in range(MOST_DEATHS):

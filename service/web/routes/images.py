@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Depends, Header, Query, Response
+from fastapi.responses import FileResponse
 from numpy.typing import NDArray
 
 from service.room.images import (
@@ -32,6 +33,7 @@ async def _rendering(window: Window = None, level: Level = None, scale: Scale = 
 
 
 How = Annotated[Rendering, Depends(_rendering)]
+_MOST_AT_ONCE_BYTES = 8 * 2**20
 _BINARY = {"schema": {"type": "string", "format": "binary"}}
 
 
@@ -71,6 +73,10 @@ def slice_image_router() -> APIRouter:
         with case.record() as record:
             path = slice_file(record, slice_id)
             key = f"dcm {record.slice(slice_id).sha256}"
+        if path.stat().st_size > _MOST_AT_ONCE_BYTES:
+            return FileResponse(
+                path, media_type="application/dicom", filename=f"slice-{slice_id}.dcm"
+            )
         name = {"Content-Disposition": f'attachment; filename="slice-{slice_id}.dcm"'}
         return _answer(case, key, match, "application/dicom", path.read_bytes, **name)
 

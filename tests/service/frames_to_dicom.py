@@ -1,6 +1,6 @@
 """Frames with known truth as DICOM files and a table of displacements, for `autospine locate`.
 
-    python -m tests.sr_engine.frames_to_dicom FRAMES.npz FOLDER [COUNT]
+    python tests/service/frames_to_dicom.py FRAMES.npz FOLDER [COUNT]
 
 writes FOLDER/template (COUNT files, 9 by default, and table.csv), FOLDER/frames (the others) and
 FOLDER/truth.csv.

@@ -1,0 +1,150 @@
+"""Storage Commitment (push model, SCP): consoles ask whether what they sent is safe here.
+
+PS3.4 annex J. An instance is committed to if its file lies in an inbox, whole by its hash. The
+report goes out on the same association where that still stands, else on a new one to where the
+configuration says that the asking AE listens.
+"""
+
+import contextlib
+import threading
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import structlog
+from pydicom.dataset import Dataset
+from pynetdicom import AE, build_role
+from pynetdicom.association import Association
+from pynetdicom.sop_class import (
+    StorageCommitmentPushModel,
+    StorageCommitmentPushModelInstance,
+)
+
+from dicom_listener.inbox import NotFromInboxError, is_whole, read_envelope
+from dicom_listener.requestor import mended
+
+REQUEST = 1
+_ALL_SAFE, _SOME_FAILED = 1, 2
+_NO_SUCH_INSTANCE, _CLASS_CONFLICT = 0x0112, 0x0119
+_NO_SUCH_ACTION, _INVALID = 0x0123, 0x0115
+_REPORT_AFTER_S = 0.1  # the answer to the request goes out first
+
+log = structlog.get_logger("listener")
+
+
+class KeptInstances:
+    """What lies in the inboxes, by SOP Instance UID; looked up anew for files that are new."""
+
+    def __init__(self, folders: Callable[[], Sequence[Path]]) -> None:
+        self._folders = folders
+        self._paths: dict[str, tuple[str, Path]] = {}  # UID: class, file
+        self._known: set[str] = set()
+        self._lock = threading.Lock()
+
+    def problem(self, sop_class: str, uid: str) -> int | None:
+        """The failure reason (PS3.3 C.14) of an instance that is not safe here; None: it is."""
+        for _ in range(2):  # a file goes from the room's inbox to its case, once
+            with self._lock:
+                self._look()
+                kept = self._paths.get(uid)
+            if kept is None:
+                return _NO_SUCH_INSTANCE
+            with contextlib.suppress(FileNotFoundError):
+                if not is_whole(kept[1]):
+                    return _NO_SUCH_INSTANCE
+                return None if kept[0] == sop_class else _CLASS_CONFLICT
+        return _NO_SUCH_INSTANCE
+
+    def _look(self) -> None:
+        for folder in self._folders():
+            for path in folder.glob("*.dcm"):
+                if str(path) in self._known:
+                    continue
+                self._known.add(str(path))
+                try:
+                    envelope, _ = read_envelope(path)
+                except (OSError, NotFromInboxError):
+                    continue
+                self._paths[envelope.sop_instance_uid] = envelope.sop_class_uid, path
+
+
+@dataclass
+class Commitment:
+    """Answers requests for one listener. reports_to: AE title -> (host, port)."""
+
+    kept: KeptInstances
+    ae_title: str
+    reports_to: Mapping[str, tuple[str, int]] = field(default_factory=dict)
+    on_unreported: Callable[[str], None] = lambda text: None
+
+    def answer(self, association: Association, action: int, asked: Dataset) -> int:
+        """The status of an N-ACTION; the report follows by itself."""
+        if action != REQUEST:
+            return _NO_SUCH_ACTION
+        if not asked.get("TransactionUID") or not asked.get("ReferencedSOPSequence"):
+            return _INVALID
+        name = f"commitment {asked.TransactionUID}"
+        threading.Thread(
+            target=self._report, args=(association, asked), name=name, daemon=True
+        ).start()
+        return 0x0000
+
+    def report_on(self, asked: Dataset) -> tuple[int, Dataset]:
+        """(event type, event information): which of the instances are safe, which are not."""
+        report = Dataset()
+        report.TransactionUID = asked.TransactionUID
+        safe, failed = [], []
+        for item in asked.ReferencedSOPSequence:
+            one = Dataset()
+            one.ReferencedSOPClassUID = item.get("ReferencedSOPClassUID", "")
+            one.ReferencedSOPInstanceUID = item.get("ReferencedSOPInstanceUID", "")
+            problem = self.kept.problem(
+                str(one.ReferencedSOPClassUID), str(one.ReferencedSOPInstanceUID)
+            )
+            if problem is None:
+                safe.append(one)
+            else:
+                one.FailureReason = problem
+                failed.append(one)
+        if safe:
+            report.ReferencedSOPSequence = safe
+        if failed:
+            report.FailedSOPSequence = failed
+        return (_SOME_FAILED if failed else _ALL_SAFE), report
+
+    def _report(self, association: Association, asked: Dataset) -> None:
+        who = str(association.requestor.ae_title).strip()
+        try:
+            event, report = self.report_on(asked)
+            time.sleep(_REPORT_AFTER_S)
+            if association.is_established and _was_taken(association, event, report):
+                return
+            if who in self.reports_to and self._on_a_new_one(who, event, report):
+                return
+            text = f"{who} could not be told of transaction {asked.TransactionUID}"
+        except Exception as error:  # whatever the peer does: it is told of it, or we say so
+            text = f"{who} could not be told what is safe: {error}"
+        self.on_unreported(text)
+
+    def _on_a_new_one(self, who: str, event: int, report: Dataset) -> bool:
+        entity = AE(self.ae_title)
+        entity.add_requested_context(StorageCommitmentPushModel)
+        host, port = self.reports_to[who]
+        role = build_role(StorageCommitmentPushModel, scp_role=True)
+        association = mended(entity.associate(host, port, ae_title=who, ext_neg=[role]))
+        if not association.is_established:
+            return False
+        try:
+            return _was_taken(association, event, report)
+        finally:
+            association.release()
+
+
+def _was_taken(association: Association, event: int, report: Dataset) -> bool:
+    answer: Any
+    answer, _ = association.send_n_event_report(
+        report, event, StorageCommitmentPushModel, StorageCommitmentPushModelInstance
+    )
+    return "Status" in answer and answer.Status == 0x0000
