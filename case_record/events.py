@@ -59,11 +59,11 @@ class Events(Connection):
         )
         return [_event(row) for row in rows]
 
-    def events_of_kind(self, kind: str, after_id: int = 0) -> list[Event]:
-        """Return all events of a kind, oldest first."""
+    def events_of_kind(self, kind: str, after_id: int = 0, after_seq: int = 0) -> list[Event]:
+        """Return all events of a kind, oldest first, after one of them or after a `seq`."""
         rows = self._db.execute(
-            "SELECT * FROM event WHERE kind = ? AND event_id > ? ORDER BY event_id",
-            (kind, after_id),
+            "SELECT * FROM event WHERE kind = ? AND event_id > ? AND seq > ? ORDER BY event_id",
+            (kind, after_id, after_seq),
         )
         return [_event(row) for row in rows]
 

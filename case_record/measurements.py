@@ -70,6 +70,15 @@ class Measurements(Connection):
         ).fetchone()
         return _measurement(row) if row else None
 
+    def first_measurement_since(self, seq: int) -> Measurement | None:
+        """The first one that was asked for after `seq` and found something."""
+        row = self._db.execute(
+            "SELECT * FROM measurement WHERE requested_seq > ? AND state = 'done'"
+            " ORDER BY measurement_id LIMIT 1",
+            (seq,),
+        ).fetchone()
+        return _measurement(row) if row else None
+
     def measurements(self, state: str | None = None) -> list[Measurement]:
         where = "state = ?" if state else "1"
         rows = self._db.execute(

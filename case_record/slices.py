@@ -82,6 +82,13 @@ class Slices(Connection):
             raise CaseRecordError(f"{self.case_dir}: there is no slice {slice_id}")
         return _slice(row)
 
+    def slices_by_hand(self) -> frozenset[int]:
+        """Ids of the used slices that a person assigned."""
+        rows = self._db.execute(
+            "SELECT slice_id FROM slice WHERE state = 'assigned' AND decided_by != 'listener'"
+        )
+        return frozenset(int(row["slice_id"]) for row in rows)
+
     def last_slice(self, state: str | None = None) -> SliceRow | None:
         where = "state = ?" if state else "1"
         row = self._db.execute(
@@ -99,17 +106,17 @@ class Slices(Connection):
         ).fetchone()
         return _slice(row) if row else None
 
-    def scans_since(self, seq: int) -> list[tuple[str, dict[str, Any]]]:
-        """(state, header) of slices that came later, one of each kind: the header has but study,
-        frame of reference and what shifts oil against water.
+    def scans_since(self, seq: int) -> list[dict[str, Any]]:
+        """The kinds of slices that came later: state, reason_code, and of the header study, frame
+        of reference and what shifts oil against water.
         """
         parts = ", ".join(f"json_extract(header, '$.{name}') AS {name}" for name in _SCAN)
         rows = self._db.execute(
-            f"SELECT DISTINCT state, {parts} FROM slice WHERE seq > ?"
+            f"SELECT DISTINCT state, reason_code, {parts} FROM slice WHERE seq > ?"
             " AND json_extract(header, '$.study_instance_uid') IS NOT NULL",
             (seq,),
         )
-        return [(row["state"], {name: row[name] for name in _SCAN}) for row in rows]
+        return [dict(row) for row in rows]
 
     def page_of_slices(
         self, *, after_id: int, limit: int, newest: bool, state: str | None

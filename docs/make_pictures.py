@@ -225,6 +225,8 @@ def animate() -> None:
             page.get_by_role("button", name="Arm the robot").click()
         film.until(lambda: client.state().robot.armed)
         click("Start the calibration")
+        film.hold(1.5)
+        click("Drive the stages – calibrate")
         film.until(lambda: client.state().calibrated and client.state().procedure is None)
         click("Pick target")
         film.hold(1.0)
@@ -249,6 +251,8 @@ def animate() -> None:
         click("Record the puncture")
         film.hold(1.5)
         click("Needle withdrawn – unlock motion")
+        film.hold(1.5)
+        click("Yes, the needle is out of the patient – unlock")
         film.hold(1.5)
         film.save(HERE / "case.webp")
 

@@ -28,7 +28,7 @@ from service.procedure.estimate import axis_sigma
 from service.procedure.plane import ImagePlane
 from service.procedure.registry import APPROACHES, CALIBRATIONS
 from service.procedure.targets import all_targets
-from service.room.history import known_targets, targets_over_time
+from service.room.history import arrival_by_hand, known_targets, targets_over_time
 from service.room.images import ImageMissingError, slice_pixels
 
 app = typer.Typer(add_completion=False)
@@ -164,6 +164,7 @@ def _approaches(record: CaseRecord) -> Iterable[str]:
                 result.get("iterations", ""),
                 result.get("frames", ""),
                 f"{minutes:.1f}",
+                "by hand" if arrival_by_hand(record, row.procedure_id) else "",
                 result.get("reason", ""),
             )
         )
@@ -179,6 +180,7 @@ def _approaches(record: CaseRecord) -> Iterable[str]:
         "moves",
         "slices",
         "min",
+        "slices used",
         "reason",
     )
     yield html_table(heads, rows)

@@ -142,9 +142,9 @@ def finding_of_puncture(record: CaseRecord, event_id: int) -> Finding:
 def _approach_during(record: CaseRecord, row: Measurement) -> Procedure | None:
     """The approach that asked for the measurement."""
     for procedure in reversed(record.procedures()):
-        if procedure.started_s <= row.requested_s:
-            until_s = procedure.ended_s
-            mine = until_s is None or row.requested_s <= until_s
+        if procedure.begun_seq < row.requested_seq:
+            until = procedure.ended_seq
+            mine = not until or row.requested_seq < until
             return procedure if mine and procedure.name in APPROACHES else None
     return None
 
@@ -156,7 +156,7 @@ def _must_be(
         return _wanted_by(row, during)
     if row.request.get("slice_position_mm") is not None or not row.result:
         return None  # one of two fiducials: the target is the needle's
-    target_mm = targets_over_time(record).at(row.requested_s)
+    target_mm = targets_over_time(record).at(row.requested_seq)
     if target_mm is None:
         return None
     return ImagePlane.from_json(row.result["plane"]).from_patient(target_mm)

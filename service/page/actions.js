@@ -13,31 +13,27 @@ const READ_FIRST_MS = 700;
 
 const post = (path, body) => () => order("POST", `api/v1/${path}`, body);
 
-// Which actions make sense now. The first one that is possible is the large button, if it is what the
-// prompt asks for (aside: it is not).
+// Which actions make sense now. Green is only what the prompt asks for.
 export function actionsFor(state) {
   const { robot } = state;
   const idle = !state.procedure;
   const free = idle && robot.linked && !robot.stopped && robot.armed && !state.ready && !robot.insertion_locked;
   const list = [];
-  const add = (label, run, possible, extra = {}) => { if (possible) list.push({ label, run, ...extra }); };
-  add(robot.stopped ? words.rearm : words.arm, post("reset"),
+  const add = (code, label, run, possible) => { if (possible) list.push({ code, label, run }); };
+  add("reset", robot.stopped ? words.rearm : words.arm, post("reset"),
     robot.linked && !robot.moving && (robot.stopped || !robot.armed || !robot.position_certain));
-  if (state.ready) {
-    add(words.puncture, "puncture", robot.insertion_locked && !state.punctured);
-    add(words.needleOut, post("needle-out"), true, { last: !state.punctured });
-  } else {
-    add(words.needleOut, post("needle-out"), robot.linked && robot.insertion_locked);
-  }
+  add("puncture", words.puncture, "puncture", state.ready && robot.insertion_locked && !state.punctured);
   const planned = state.target_patient_mm && (!state.guide || state.entry_patient_mm);
-  add(words.approach, post("approach"), free && state.calibrated && planned);
-  add(words.pick, "pick", free && state.calibrated && !planned && state.slice);
-  add(words.calibrate, post("calibration"), free, { aside: state.calibrated });
-  add(words.targetHere, post("target/here"), free && state.calibrated && !state.guide);
+  add("approach", words.approach, post("approach"), free && state.calibrated && planned);
+  add(state.target_patient_mm ? "entry" : "target", words.pick, "pick", free && state.calibrated && !planned && state.slice);
+  add("calibration", words.calibrate, "calibration", free);
+  add("target-here", words.targetHere, post("target/here"), free && state.calibrated && !state.guide);
   const wanted = state.acquisition_request;
-  add(words.acquired(wanted?.hold_id), post("acquisition", { hold_id: wanted?.hold_id }), state.arrival_mode && wanted);
-  add(words.abort, post("abort"), !idle);
-  return list.sort((a, b) => (a.last ? 1 : 0) - (b.last ? 1 : 0));
+  add("acquisition", words.acquired(wanted?.hold_id), post("acquisition", { hold_id: wanted?.hold_id }), state.arrival_mode && wanted);
+  add("abort", words.abort, post("abort"), !idle);
+  // last and apart, never where another button has been: it takes two steps besides
+  add("needle-out", words.needleOut, "needle-out", robot.linked && (state.ready || robot.insertion_locked));
+  return list;
 }
 
 const drawChips = whenChanged((robot) => {
@@ -71,13 +67,14 @@ export class Next {
     setText(byId("said"), state.punctured ? words.punctured : "");
     forgetOldRefusal(state);
     this.drawQuestion(state.question, state);
-    this.drawActions([role, actionsFor(state).map((action) => action.label), state.question?.question_id], state);
+    this.drawActions([role, actionsFor(state).map((action) => action.label), state.question?.question_id, state.next_action], state);
   }
 
   actions(state) {
     const list = state.question ? actionsFor(state).filter((a) => a.label === words.abort) : actionsFor(state);
-    replace(byId("actions"), list.map((action, place) => h("button", {
-      type: "button", class: place === 0 && !state.procedure && !action.aside ? "main" : null, disabled: !this.mayAct,
+    replace(byId("actions"), list.map((action) => h("button", {
+      type: "button", disabled: !this.mayAct,
+      class: [action.code === state.next_action ? "main" : "", action.code === "needle-out" ? "apart" : ""].join(" ").trim() || null,
       title: this.mayAct ? null : words.viewersOnly,
       onclick: () => this.run(action.run),
     }, action.label)));
@@ -85,8 +82,21 @@ export class Next {
 
   run(what) {
     if (what === "puncture") return this.askDepth();
+    if (what === "needle-out") return this.ask(h("p", {}, words.needleOutWhy), words.needleOutSure, post("needle-out"));
+    if (what === "calibration") return this.ask([h("p", {}, words.drivesWhy), this.drives()], words.drivesSure, post("calibration"));
     if (what === "pick") return this.onPick();
     return act(what);
+  }
+
+  // The second step of what is not done by one click: the answer lies below what is asked.
+  ask(question, yes, run) {
+    replace(byId("actions"), question,
+      h("button", { type: "button", onclick: () => this.actions(this.state) }, words.cancel),
+      h("button", { type: "button", class: "apart", onclick: () => act(run).then(() => this.actions(this.state)) }, yes));
+  }
+
+  drives() {
+    return h("ul", {}, this.state.calibration_drives.map(({ axis, stops_mm: stops }) => h("li", {}, words.drives(axis, stops.map((at) => mm(at, 1)).join(" → ")))));
   }
 
   askDepth() {
@@ -108,14 +118,18 @@ export class Next {
     box.hidden = !question;
     if (!question) return replace(box);
     const plan = question.plan;
+    const enable = (on) => buttons.forEach((button) => { button.disabled = !on; });
+    const answer = async (choice) => {
+      enable(false); // one click is one answer
+      const body = { question_id: question.question_id, choice, ...(plan ? { plan_id: plan.plan_id } : {}) };
+      if (!await act(() => order("POST", "api/v1/answer", body))) enable(true);
+    };
     const buttons = question.choices.map((choice) => h("button", {
       type: "button", class: choice === question.choices[0] ? "main" : null,
       id: choice === "confirm" ? "confirm" : null, disabled: true,
-      onclick: () => act(() => order("POST", "api/v1/answer", {
-        question_id: question.question_id, choice, ...(plan ? { plan_id: plan.plan_id } : {}),
-      })),
+      onclick: () => answer(choice),
     }, labelOf(choice)));
-    if (this.mayAct) setTimeout(() => buttons.forEach((button) => { button.disabled = false; }), READ_FIRST_MS);
+    if (this.mayAct) setTimeout(() => enable(true), READ_FIRST_MS);
     replace(box, h("div", { class: "answers" }, buttons), plan ? planTable(plan, state) : null);
   }
 }

@@ -61,12 +61,20 @@ export async function getPixels(path) {
   return { values, rows, cols };
 }
 
+// An order says when it was given, by the service's own clock as its last beat told it: one that a
+// browser held back is not carried out late.
+let clockAheadS = null;
+export const heardClock = (clockS) => { clockAheadS = clockS - performance.now() / 1000; };
+const askedAt = () => (clockAheadS === null ? {} : { "X-Asked-At": (clockAheadS + performance.now() / 1000).toFixed(3) });
+
 // A command that is sent twice (a lost answer, a double click) is carried out once.
 export async function order(method, path, body = {}) {
-  const answer = await request(method, path, body, { "Idempotency-Key": onceKey() });
+  const answer = await request(method, path, body, { "Idempotency-Key": onceKey(), ...askedAt() });
   return answer.status === 204 || answer.status === 202 ? null : answer.json();
 }
 
+// What became of it: stopped, on_its_way or not_delivered.
 export async function stopRobot(emergency = false) {
-  await request("POST", "api/v1/stop", { emergency });
+  const answer = await request("POST", "api/v1/stop", { emergency });
+  return (await answer.json()).outcome;
 }

@@ -81,15 +81,30 @@ export async function drawAside(state, role) {
   const count = state.slices.quarantined ?? 0;
   setText(byId("aside-count"), count ? String(count) : "");
   const rows = await get("api/v1/slices?state=quarantined&newest=true&limit=30");
-  const hold = state.hold;
   showTable(byId("aside"), words, rows, (row) => h("tr", {},
     h("td", { class: "left" }, h("a", { href: `api/v1/slices/${row.slice_id}/image.png?scale=4`, target: "_blank", rel: "noopener" }, String(row.slice_id))),
     h("td", { class: "left" }, clock(row.received_s)),
     h("td", { class: "left" }, row.reason || plain(row.reason_code)),
-    h("td", {}, role === "operator" && hold && row.geometry ? h("button", {
-      type: "button", class: "small", onclick: () => act(() => order("POST", `api/v1/slices/${row.slice_id}/assignment`, { hold_id: hold.hold_id })),
-    }, words.use(hold.hold_id)) : null)));
+    h("td", {}, role === "operator" && row.offered_hold_id ? useAtHold(row, words) : null)));
   giveUp(role === "operator" && rows.length > 0);
+}
+
+// A slice is offered only for the hold that it can be of, and whoever says so says why.
+function useAtHold(row, words) {
+  const hold = row.offered_hold_id;
+  const ask = (event) => {
+    const why = h("input", { required: true, maxLength: 500, "aria-label": words.why, placeholder: words.why });
+    const form = h("form", {
+      class: "row",
+      onsubmit: (submitted) => {
+        submitted.preventDefault();
+        act(() => order("POST", `api/v1/slices/${row.slice_id}/assignment`, { hold_id: hold, why: why.value }));
+      },
+    }, why, h("button", { class: "small" }, words.use(hold)));
+    event.target.replaceWith(form);
+    why.focus();
+  };
+  return h("button", { type: "button", class: "small", onclick: ask }, words.use(hold));
 }
 
 export const drawCase = whenChanged(({ description, case_uid, role }) => {

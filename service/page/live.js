@@ -1,6 +1,8 @@
 // The event stream: the state whenever it changes, each new event of the record, and a beat every
 // third of a second, so that silence is noticed even when the connection looks open.
 
+import { openStream } from "./stream.js";
+
 const SILENT_MS = 1000;
 // the service answers, but its control loop has not said anything for so long
 const OLD_S = 1;
@@ -18,16 +20,19 @@ export class Live {
   open(afterId) {
     this.lastId = Math.max(afterId, this.lastId);
     this.source?.close();
-    const source = new EventSource(`api/v1/events/live?after=${this.lastId}`);
+    const source = openStream(this.lastId);
     this.source = source;
-    source.addEventListener("state", (message) => this.heard(() => this.on.onState(JSON.parse(message.data))));
+    source.addEventListener("state", (message) => this.heard(() => {
+      const heardMs = performance.now() - (message.ageMs ?? 0);
+      this.on.onState({ ...JSON.parse(message.data), heard_ms: heardMs });
+    }));
     source.addEventListener("record", (message) => this.heard(() => {
       this.lastId = Number(message.lastEventId) || this.lastId;
       this.on.onEvent(JSON.parse(message.data));
     }));
     source.addEventListener("beat", (message) => {
-      const { age_s: ageS, now_s: nowS } = JSON.parse(message.data);
-      this.on.onClock(nowS);
+      const { age_s: ageS, now_s: nowS, clock_s: clockS } = JSON.parse(message.data);
+      this.on.onClock(nowS, clockS);
       if (ageS > OLD_S) this.lost(ageS);
       else this.heard(() => {});
     });

@@ -1,27 +1,32 @@
 // Ties the page together: who is looking, the event stream, and what is drawn from the state.
 
-import { get, stopRobot } from "./api.js";
-import { act, Next, showRefusal } from "./actions.js";
+import { get, heardClock } from "./api.js";
+import { act, Next } from "./actions.js";
 import { drawAlarms } from "./alarms.js";
 import { drawBelief } from "./belief.js";
 import { byId, setHidden, setText, whenChanged } from "./dom.js";
 import { drawNumbers } from "./distance.js";
 import { drawHead, drawLights, showLost, showUp, startHeader } from "./header.js";
 import { drawHistory } from "./history_plot.js";
+import { guard } from "./guard.js";
 import { Images } from "./images.js";
 import { addEvent, drawAside, drawCase, drawJog, drawPast, drawTargets } from "./lists.js";
 import { Live } from "./live.js";
 import { askForToken, leave, whoAmI } from "./login.js";
+import { measuredAt } from "./measured_age.js";
 import { drawNeedle } from "./needle_view.js";
 import { drawProposals } from "./proposals.js";
 import { drawScannerClock, heardFromRoom } from "./scanner_clock.js";
 import { drawStages } from "./stage_map.js";
+import { StopButton } from "./stop_button.js";
 import { drawParts, keepCounting } from "./system_status.js";
 import { TEXTS } from "./texts.js";
 
 const page = { state: null, role: "viewer", measurements: [], connected: false };
 const images = new Images(byId("images"));
 const next = new Next(() => images.picking.toggle());
+const stop = new StopButton(byId("stop"), byId("stop-said"));
+guard(byId("next"));
 
 const HEADINGS = {
   "h-alarms": TEXTS.alarms, "h-belief": TEXTS.belief, "h-history": TEXTS.history, "h-stages": TEXTS.stages, "h-events": TEXTS.events,
@@ -71,22 +76,10 @@ async function loadMeasurements() {
   drawHistory({ measurements: page.measurements, toleranceMm: page.state.tolerance_mm, guide: page.state.guide });
 }
 
-async function pressStop(emergency = false) {
-  const button = byId("stop");
-  try {
-    await stopRobot(emergency);
-    button.classList.add("sent");
-    setTimeout(() => button.classList.remove("sent"), 3000);
-    showRefusal("");
-  } catch (error) {
-    showRefusal(TEXTS.next.stopFailed(error.message));
-  }
-}
-
 const live = new Live({
-  onState: (state) => { heardFromRoom(state.at_s); draw(state); },
+  onState: (state) => { heardFromRoom(state.at_s); draw(state); measuredAt(state); stop.heard(state.robot); },
   onEvent: addEvent,
-  onClock: heardFromRoom,
+  onClock: (nowS, clockS) => { heardFromRoom(nowS); heardClock(clockS); },
   onUp: () => { page.connected = true; showUp(); },
   onDown: async (seconds, failures) => {
     page.connected = false;
@@ -114,12 +107,12 @@ async function begin() {
   keepCounting();
 }
 
-byId("stop").onclick = () => pressStop();
-byId("emergency").onclick = () => pressStop(true);
+byId("stop-form").onsubmit = (event) => { event.preventDefault(); stop.press(); };
+byId("emergency").onclick = () => stop.press(true);
 byId("leave").onclick = () => act(leave);
 // STOP from anywhere on the page, whatever has the focus, before anything else sees the key.
 addEventListener("keydown", (event) => {
-  if (event.key === "Escape") pressStop();
+  if (event.key === "Escape") stop.press();
 }, { capture: true });
 startHeader();
 

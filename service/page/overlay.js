@@ -2,6 +2,7 @@
 
 import { s } from "./dom.js";
 import { ellipse, pixelFromPatient } from "./geometry.js";
+import { reachable, reachOutline } from "./reach.js";
 
 const FIDUCIAL_MM = 4;
 const SIGMAS = 3;
@@ -40,8 +41,13 @@ export function overlay(geometry, state, { found, named, current, picked }) {
     ...(target ? mark(at(target), "c-target", tolerance) : []),
     ...(entry ? mark(at(entry), "c-entry", 0.8) : []),
     ...(entry && target ? [line(at(entry), at(target), "c-entry dash")] : []),
-    ...(picked ? mark(at(picked), "c-plan dash", 1) : []),
+    ...(picked ? [...reach(at, state), ...mark(at(picked), "c-plan dash", 1)] : []),
   ];
+}
+
+function reach(at, state) {
+  const corners = reachable(state);
+  return corners ? [reachOutline(at(state.measurement.patient_mm), corners)] : [];
 }
 
 const line = ([x1, y1], [x2, y2], kind) => s("line", { x1, y1, x2, y2, class: `thin ${kind}` });

@@ -1,7 +1,7 @@
 // Picking a target or an entry point: click, look at what it means, correct, then set.
 
 import { order } from "./api.js";
-import { act } from "./actions.js";
+import { act, showRefusal } from "./actions.js";
 import { byId, h, replace, setHidden, setText } from "./dom.js";
 import { mm } from "./format.js";
 import { inWords, patientFromPixel, pixelFromPatient } from "./geometry.js";
@@ -103,6 +103,8 @@ export class Picking {
   }
 
   async set(what) {
+    const empty = this.inputs.find((input) => !Number.isFinite(input.valueAsNumber));
+    if (empty) return showRefusal(words.empty(empty.getAttribute("aria-label")));
     const more = what === "target" ? { in_water: this.inTissue.checked, label: this.label.value.trim() } : {};
     if (await act(() => order("PUT", `api/v1/${what}`, { patient_mm: this.point, ...more }))) this.end();
   }

@@ -39,7 +39,11 @@ export const TEXTS = {
     approach: "Start the approach", pick: "Pick the target on the slice", calibrate: "Start the calibration", targetHere: "Set the target to where the fiducial is now",
     acquired: (hold) => `Slices for hold ${hold} acquired`,
     abort: "End the procedure",
-    stopFailed: (why) => `STOP could not be sent: ${why} Use the stop switch at the robot.`,
+    needleOutSure: "Yes, the needle is out of the patient – unlock",
+    needleOutWhy: "Motion is unlocked by this. Is the needle out of the patient?",
+    drives: (axis, stops) => `${axis}: ${stops} mm`,
+    drivesWhy: "The calibration drives the stages without asking again:",
+    drivesSure: "Drive the stages – calibrate",
   },
   chips: {
     stopped: "Stopped", armed: "Armed", notArmed: "Not armed", moving: "Moving", still: "Standing still",
@@ -57,6 +61,7 @@ export const TEXTS = {
     noFiducial: (why) => `No fiducial found: ${why}`, atReady: "Known when the next move is planned, and at READY.", nothing: "No target or no measurement yet.",
     lies: (where) => `The target lies ${where}.`, liesByNewest: (where) => `By the newest slices alone the target lies ${where}.`,
     within: (mm) => `Probability within ${mm} mm`, withinTitle: "that the true distance is below the tolerance",
+    measured: (age, left) => `Measured ${age} ago${left}.`, goodFor: (left) => `, good for ${left} more`,
     tipBelow: "Tip below lower joint", slices: "Slices", snr: "Signal to noise", chi2: "χ² per degree of freedom", method: "Method",
   },
   needle: {
@@ -99,6 +104,7 @@ export const TEXTS = {
     inTissueWhy: "Oil in the fiducial and water in tissue appear shifted against each other in the slice. Tick this for an anatomical target: the shift is then corrected.",
     distance: (mm, where) => `${mm} mm from the fiducial${where ? `: ${where}` : ""}.`,
     reachable: "Within the robot's travel.", unreachable: (axis, mm, low, high) => `Out of reach: axis ${axis} would have to go to ${mm} mm (travel ${low} to ${high} mm).`,
+    empty: (field) => `Not set: ${field} is empty.`,
     reachUnknown: "Reach is known after a calibration.",
     setTarget: "Set target", setEntry: "Set entry point", withdraw: "Withdraw the target", cancel: "Cancel",
     notSlice: "The point lies in the slice that is shown.",
@@ -115,7 +121,7 @@ export const TEXTS = {
   alarms: { heading: "Alarms", none: "No alarms.", todo: "What to do:", more: (count) => `${count} more`, all: "All alarms" },
   events: { heading: "Event log", more: "Show more", fewer: "Show fewer", from: (id, source) => `event ${id}, from ${source}` },
   aside: {
-    heading: "Slices set aside", columns: ["Slice", "Received", "Why", ""], none: "None.", use: (hold) => `Use at hold ${hold}`,
+    heading: "Slices set aside", columns: ["Slice", "Received", "Why", ""], none: "None.", use: (hold) => `Use at hold ${hold}`, why: "Why is it of this hold?",
     giveUp: "No more slices will come for hold", giveUpButton: "Stop waiting for these slices", giveUpWhy: "said on the page",
   },
   caseCard: {

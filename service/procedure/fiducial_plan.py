@@ -10,6 +10,7 @@ import numpy as np
 from room_config.load import Config
 from service.procedure.approach import ApproachArguments
 from service.procedure.calibration import Calibration, CalibrationArguments
+from service.procedure.identity import ProofArguments
 from service.procedure.plan import Travel, check_travel
 from service.procedure.recording import RecordingArguments
 from service.procedure.sensing import ValidationGate
@@ -53,8 +54,13 @@ def approach_of(
     target: Target,
     header: Mapping[str, Any],
     seed: int,
+    *,
+    proven: bool = False,
 ) -> ApproachArguments:
-    """To where the fiducial must appear to be at the target. Raises TargetError."""
+    """To where the fiducial must appear to be at the target. Raises TargetError.
+
+    proven: what `start` says was seen to move with the robot.
+    """
     polarity = config.imaging.readout_polarity
     row, col = fiducial_must_appear_at(target, start.plane, header, polarity).tolist()
     service = config.service
@@ -68,11 +74,12 @@ def approach_of(
         gate=gate_of(config),
         strategy=service.strategy,
         seed=seed,
+        proven=proven,
         most_frames=service.most_slices,
     )
 
 
-def recording_of(config: Config, seed: int) -> RecordingArguments:
+def recording_of(config: Config, seed: int, proof: ProofArguments) -> RecordingArguments:
     """Where the fiducial is now, by the room's strategy."""
     service = config.service
     return RecordingArguments(
@@ -80,6 +87,7 @@ def recording_of(config: Config, seed: int) -> RecordingArguments:
         sigma_mm=service.tolerance_mm / TARGET_SHARE,
         gate=gate_of(config),
         seed=seed,
+        proof=proof,
     )
 
 

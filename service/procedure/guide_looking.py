@@ -77,6 +77,10 @@ class GuideLook:
         return self.seen.frames
 
     @property
+    def after_loss(self) -> bool:
+        return any(one.after_loss for one in self.seen.measured)
+
+    @property
     def frames_of_each(self) -> int:
         return self.seen.measured[0].frames
 

@@ -17,6 +17,7 @@ from service.procedure.guide_approach import GuideApproachArguments
 from service.procedure.guide_calibration import GuideCalibrationArguments
 from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_recording import GuideRecordingArguments
+from service.procedure.identity import ProofArguments
 from service.procedure.plan import Travel, check_travel
 from service.procedure.targets import Target, TargetError, needle_line, oil_shift_mm
 
@@ -48,13 +49,16 @@ def guide_calibration_of(
     )
 
 
-def guide_recording_of(config: Config, guide: GuideConfig) -> GuideRecordingArguments:
+def guide_recording_of(
+    config: Config, guide: GuideConfig, proof: ProofArguments
+) -> GuideRecordingArguments:
     """Where the guide points now, the tip judged where a target usually lies."""
     return GuideRecordingArguments(
         geometry=geometry_of(guide),
         lower_plane_mm=guide.lower_plane_mm,
         sigma_mm=guide.tolerance_mm / TARGET_SHARE,
         gate=gate_of(config),
+        proof=proof,
     )
 
 
@@ -66,6 +70,8 @@ def guide_approach_of(
     entry_mm: tuple[float, float, float],
     target: Target,
     header: Mapping[str, Any],
+    *,
+    proven: bool = False,
 ) -> GuideApproachArguments:
     """To the line from entry to target, the tip judged at the target. Raises TargetError."""
     line = needle_line(
@@ -93,5 +99,6 @@ def guide_approach_of(
         max_iterations=service.max_iterations,
         confirm_moves=service.confirm_moves,
         gate=gate_of(config),
+        proven=proven,
         most_frames=service.most_slices,
     )

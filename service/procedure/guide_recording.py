@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from service.procedure.guide_geometry import (
     tip_of,
 )
 from service.procedure.guide_looking import GuideLook, look_at_guide, look_at_guide_longer
+from service.procedure.identity import ProofArguments, show_that_it_follows
 from service.procedure.kinematics import Line
 from service.procedure.sensing import ProcedureFailedError, ValidationGate, check_prediction
 from service.procedure.steps import ProcedureSteps
@@ -27,13 +28,15 @@ _MOST_FRAMES = 8
 class GuideRecordingArguments:
     """sigma_mm: how well the tip's place is to be known (worst axis), as far as slices can do it.
 
-    lower_plane_mm: of the lower ball joints along the slice normal.
+    lower_plane_mm: of the lower ball joints along the slice normal. proof: what a move needs that
+    shows whether what is seen are the fiducials.
     """
 
     geometry: GuideGeometry
     lower_plane_mm: float
     sigma_mm: float
     gate: ValidationGate
+    proof: ProofArguments = field(default_factory=ProofArguments)
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,6 +78,18 @@ def record_guide(
     prior, geometry = start.estimate, arguments.geometry
     look = yield from look_at_guide(geometry, prior, arguments.gate, fresh=True)
     check_prediction(prior, look.found, arguments.gate)
+    if not arguments.proof.proven or look.after_loss:
+        seen = replace(start, estimate=look.found, measurement_id=look.measurement_id)
+        gate = arguments.gate
+        prior = yield from show_that_it_follows(
+            seen,
+            arguments.proof,
+            gate,
+            "guide",
+            lambda there: look_at_guide(geometry, there.estimate, gate, fresh=False),
+        )
+        look = yield from look_at_guide(geometry, prior, gate, fresh=False)
+        check_prediction(prior, look.found, gate)
     wanted = _slices_for(geometry, look, arguments.sigma_mm)
     if wanted > look.frames_of_each:
         look = yield from look_at_guide_longer(geometry, look, arguments.gate, frames=wanted)

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
 
 from service.procedure.calibration import Calibration
 from service.procedure.estimate import FiducialEstimate, axis_sigma
+from service.procedure.identity import ProofArguments, show_that_it_follows
 from service.procedure.sensing import ValidationGate, check_prediction
 from service.procedure.steps import ProcedureSteps
 from service.procedure.strategies import STRATEGIES, Look, look_at_fiducial, look_longer
@@ -19,12 +20,16 @@ _MOST_FRAMES = 8
 
 @dataclass(frozen=True)
 class RecordingArguments:
-    """sigma_mm: how well the place is to be known (worst axis), as far as slices can do that."""
+    """sigma_mm: how well the place is to be known (worst axis), as far as slices can do that.
+
+    proof: what a move needs that shows whether what is seen is the fiducial.
+    """
 
     strategy: str
     sigma_mm: float
     gate: ValidationGate
     seed: int = 0
+    proof: ProofArguments = field(default_factory=ProofArguments)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,6 +69,18 @@ def record_place(arguments: RecordingArguments, start: Calibration) -> Procedure
     gate, seed = arguments.gate, (arguments.seed, 0)
     look = yield from look_at_fiducial(strategy.fine, start, gate, seed=seed, fresh=True)
     check_prediction(start.estimate, look.found, gate)
+    if not arguments.proof.proven or look.after_loss:
+        seen = replace(start, estimate=look.found, measurement_id=look.measurement_id)
+        away = yield from show_that_it_follows(
+            seen,
+            arguments.proof,
+            gate,
+            "fiducial",
+            lambda there: look_at_fiducial(strategy.fine, there, gate, seed=seed, fresh=False),
+        )
+        start = replace(start, estimate=away)
+        look = yield from look_at_fiducial(strategy.fine, start, gate, seed=seed, fresh=False)
+        check_prediction(start.estimate, look.found, gate)
     if not strategy.fuses or look.acquired is None:
         return _place(start, look.found, look)
     wanted = slices_for(look.found, look.frames, arguments.sigma_mm)

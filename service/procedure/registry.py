@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import asdict, fields
+from dataclasses import asdict, dataclass, fields, replace
 from typing import Any
 
-from case_record.record import CaseRecord
+from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Procedure
 from service.procedure.approach import ApproachArguments, Arrival, approach
 from service.procedure.calibration import Calibration, CalibrationArguments, calibrate
@@ -14,10 +14,11 @@ from service.procedure.guide_approach import GuideApproachArguments, GuideArriva
 from service.procedure.guide_calibration import GuideCalibrationArguments, calibrate_guide
 from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_recording import GuidePlace, GuideRecordingArguments, record_guide
-from service.procedure.jog import JogEnd, jog
+from service.procedure.identity import ProofArguments
 from service.procedure.recording import Place, RecordingArguments, record_place
-from service.procedure.sensing import ValidationGate
-from service.procedure.steps import ProcedureSteps
+from service.procedure.scan_frame import frame_of, other_place_since
+from service.procedure.sensing import ValidationGate, move
+from service.procedure.steps import MoveTo, ProcedureSteps
 
 CALIBRATION = "calibration"
 APPROACH = "approach"
@@ -25,7 +26,7 @@ RECORDING = "recording"
 GUIDE_CALIBRATION = "guide_calibration"
 GUIDE_APPROACH = "guide_approach"
 GUIDE_RECORDING = "guide_recording"
-JOG = "jog"
+JOG, JOG_PURPOSE = "jog", "manual"
 CALIBRATIONS, APPROACHES = (CALIBRATION, GUIDE_CALIBRATION), (APPROACH, GUIDE_APPROACH)
 
 Arguments = (
@@ -36,6 +37,22 @@ Arguments = (
     | GuideApproachArguments
     | GuideRecordingArguments
 )
+
+
+@dataclass(frozen=True)
+class JogEnd:
+    """Where the axes stood when the move had ended."""
+
+    readback_um: Mapping[str, int]
+
+    def to_json(self) -> dict[str, Any]:
+        return {"readback_um": dict(self.readback_um)}
+
+
+def jog(setpoints_um: Mapping[str, int]) -> ProcedureSteps[JogEnd]:
+    """Go to the setpoints; raises ProcedureFailedError if the bridge refuses."""
+    moved = yield from move(MoveTo(dict(setpoints_um), JOG_PURPOSE))
+    return JogEnd(moved.readback_um)
 
 
 def build_procedure(row: Procedure) -> ProcedureSteps[Any]:
@@ -90,7 +107,8 @@ def result_to_json(
 
 
 def latest_calibration(record: CaseRecord, *, guide: bool = False) -> Calibration | None:
-    """What the last procedure that came to its end knew; a later calibration replaces it.
+    """What the last procedure that came to its end knew; a later calibration replaces it. None
+    without one, and once slices of another frame of reference have come.
 
     guide: of both fiducials and four axes, else of one and two.
     """
@@ -103,7 +121,27 @@ def latest_calibration(record: CaseRecord, *, guide: bool = False) -> Calibratio
         if row is not None and row.result is not None and row.procedure_id > newest.procedure_id:
             newest = row
     known = newest.result or {}
-    return Calibration.from_json(known.get("calibration", known))
+    found = Calibration.from_json(known.get("calibration", known))
+    return None if _is_of_another_place(record, found) else found
+
+
+def _is_of_another_place(record: CaseRecord, calibration: Calibration) -> bool:
+    """True if its frame of reference is not that of now: plane and estimate mean nothing there."""
+    try:
+        measurement = record.measurement(calibration.measurement_id)
+        frame = frame_of(record, measurement)
+    except CaseRecordError:
+        return False
+    if frame is None:
+        return False
+    here = replace(frame, study="")  # another study on the same table: the frame tells
+    return bool(other_place_since(record, measurement.requested_seq, here))
+
+
+def _with_proof(known: dict[str, Any]) -> dict[str, Any]:
+    """The arguments of a proof move again; a program before did not know of any."""
+    proof = known.get("proof")
+    return known if proof is None else {**known, "proof": ProofArguments(**proof)}
 
 
 def _build_calibration(value: Mapping[str, Any]) -> ProcedureSteps[Calibration]:
@@ -125,7 +163,7 @@ def _build_approach(value: Mapping[str, Any]) -> ProcedureSteps[Arrival]:
 
 
 def _build_recording(value: Mapping[str, Any]) -> ProcedureSteps[Place]:
-    arguments = RecordingArguments(**_with_gate(value["arguments"]))
+    arguments = RecordingArguments(**_with_proof(_with_gate(value["arguments"])))
     return record_place(arguments, Calibration.from_json(value["start"]))
 
 
@@ -155,7 +193,9 @@ def _build_guide_approach(value: Mapping[str, Any]) -> ProcedureSteps[GuideArriv
 def _build_guide_recording(value: Mapping[str, Any]) -> ProcedureSteps[GuidePlace]:
     known = _with_gate(value["arguments"])
     known["geometry"] = _guide_geometry(known["geometry"])
-    return record_guide(GuideRecordingArguments(**known), Calibration.from_json(value["start"]))
+    return record_guide(
+        GuideRecordingArguments(**_with_proof(known)), Calibration.from_json(value["start"])
+    )
 
 
 _BUILDERS: dict[str, Callable[[Mapping[str, Any]], ProcedureSteps[Any]]] = {

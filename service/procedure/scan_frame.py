@@ -11,6 +11,9 @@ from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
+from case_record.record import CaseRecord
+from case_record.rows import Measurement
+
 _SAME_SHARE = 1e-3
 
 
@@ -63,6 +66,50 @@ class ScanFrame:
                 f"instead of {self.phase_encoding_direction or 'unknown'})"
             )
         return ""
+
+
+STUDY_ACCEPTED, SLICE_HELD = "study_accepted", "slice_held"
+OTHER_PATIENT, OTHER_STUDY = "other_patient", "other_study"
+
+
+def newest_frame(record: CaseRecord) -> ScanFrame | None:
+    """Of the newest slice that is used; None before the first one."""
+    newest = record.last_slice("assigned")
+    return None if newest is None else ScanFrame.of_header(newest.header)
+
+
+def frame_of(record: CaseRecord, measurement: Measurement) -> ScanFrame | None:
+    """Of the slices that were measured; None where the record does not say."""
+    slice_id = (measurement.result or {}).get("slice_id")
+    return None if slice_id is None else ScanFrame.of_header(record.slice(int(slice_id)).header)
+
+
+def other_place_since(record: CaseRecord, seq: int, frame: ScanFrame) -> str:
+    """What came after `seq` that says that the table may have moved since `frame`; empty if
+    nothing did.
+    """
+    newest = newest_frame(record)
+    if newest is not None and (other := frame.other_place(newest)):
+        return other
+    accepted = record.last_event(STUDY_ACCEPTED)
+    if accepted is not None and accepted.seq > seq:
+        study, reference = (
+            str(accepted.body.get(k) or "") for k in ("study", "frame_of_reference")
+        )
+        if other := frame.other_place(ScanFrame(study, reference)):
+            return other
+    for came in record.scans_since(seq):
+        if came["reason_code"] == OTHER_PATIENT:
+            continue  # somebody else's, on another table
+        if other := frame.other_place(ScanFrame.of_header(came)):
+            return other
+    return ""
+
+
+def other_study_held_since(record: CaseRecord, seq: int) -> bool:
+    """Whether slices of another study of nobody else came, and wait outside of the case."""
+    held = record.events_of_kind(SLICE_HELD, after_seq=seq)
+    return any(event.body.get("code") == OTHER_STUDY for event in held)
 
 
 def _differ(mine: str, others: str) -> bool:

@@ -10,8 +10,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from dicom_slice.reasons import Reason
 from service.procedure.estimate import FiducialEstimate, MotionNoise, motion_covariance
 from service.procedure.jacobian import ImageJacobian
+from service.procedure.plan import Plan
 from service.procedure.plane import ImagePlane
 from service.procedure.steps import (
     Acquire,
@@ -29,6 +31,10 @@ from service.procedure.steps import (
 
 Array = NDArray[np.float64]
 _TRIES = 3
+# the slices could not be used: that says nothing of the fiducial
+_NOT_EVEN_LOOKED = frozenset({"no_slices", "geometry_changed", "disturbed", *map(str, Reason)})
+CONFIRM = "confirm"
+REJECT = "reject"
 RESCAN = "rescan"
 ABORT = "abort"
 
@@ -87,6 +93,15 @@ def move(step: MoveTo) -> ProcedureSteps[Moved]:
     raise ProcedureFailedError(moved.code, text)
 
 
+def ask_to_confirm(name: str, plan: Plan) -> ProcedureSteps[None]:
+    """Wait for the operator; raises ProcedureFailedError unless the plan is confirmed."""
+    row, col = plan.displacement_mm
+    question = f"Move the {name} by ({row:+.3f}, {col:+.3f}) mm (row, col)?"
+    answer = yield from ask(AskOperator(question, (CONFIRM, REJECT), plan.to_json()), Answered)
+    if answer.choice != CONFIRM:
+        raise ProcedureFailedError("rejected", f"the move was rejected by {answer.who}")
+
+
 def measure_here(
     method: str,
     expectation: Expectation | None,
@@ -98,6 +113,7 @@ def measure_here(
 
     fresh: the robot has not moved since the last measurement, which must not count twice.
     """
+    lost = False
     for attempt in range(_TRIES):
         # a new hold: the slices that could not be used stay out of the next try
         acquired = yield from ask(Acquire(1, fresh or attempt > 0, slice_position_mm), Acquired)
@@ -105,7 +121,8 @@ def measure_here(
         step = _measure_step(holds, method, expectation, slice_position_mm=slice_position_mm)
         measured = yield from ask(step, Measured)
         if measured.ok:
-            return acquired, measured
+            return acquired, replace(measured, after_loss=lost)
+        lost = lost or measured.reason_code not in _NOT_EVEN_LOOKED
         yield from _ask_to_rescan(measured)
     raise ProcedureFailedError(measured.reason_code, f"no usable measurement: {measured.reason}")
 

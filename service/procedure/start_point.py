@@ -8,8 +8,15 @@ from dataclasses import replace
 import numpy as np
 
 from case_record.record import CaseRecord
+from case_record.rows import Measurement
 from service.procedure.calibration import Calibration
 from service.procedure.estimate import MotionNoise
+from service.procedure.scan_frame import (
+    frame_of,
+    newest_frame,
+    other_place_since,
+    other_study_held_since,
+)
 
 POSITION_DECLARED = "position_declared"
 # what may have moved the robot unseen, or made its count another one, per axis
@@ -21,15 +28,22 @@ def start_point(
     calibration: Calibration,
     positions_um: Mapping[str, int],
     noise: MotionNoise,
+    *,
+    stood: bool = True,
 ) -> Calibration:
     """Return the calibration as it holds where the robot stands now.
 
-    If anything happened since its last measurement, the fiducial's place is as good as unknown: a
+    stood: as far as the robot's bridge knows, it has not moved since the last measurement. If
+    anything happened since then, the fiducial's place is as good as unknown: a
     procedure that starts from it looks before it moves.
     """
     estimate = calibration.estimate
     here = dict(positions_um)
-    if dict(estimate.setpoints_um) == here and is_untouched(record, calibration.measurement_id):
+    if (
+        stood
+        and dict(estimate.setpoints_um) == here
+        and is_untouched(record, calibration.measurement_id)
+    ):
         return calibration
     moved = estimate.moved_to(here, calibration.jacobian, noise)
     unseen = np.eye(len(moved.plane_mm)) * _UNSEEN_MOVE_MM**2
@@ -38,8 +52,22 @@ def start_point(
     )
 
 
+def is_proven(record: CaseRecord, start: Calibration, positions_um: Mapping[str, int]) -> bool:
+    """True if the fiducial of this start was seen to move with the robot, and nothing since speaks
+    against it: it stands where it was seen, was not lost, and is in the same scan.
+
+    Every procedure that comes to its end ends with a fiducial that is proven, see `identity`.
+    """
+    here = dict(start.estimate.setpoints_um) == dict(positions_um)
+    if not here or not is_untouched(record, start.measurement_id):
+        return False
+    newest = record.last_measurement()
+    return newest is not None and newest.measurement_id == start.measurement_id
+
+
 def is_untouched(record: CaseRecord, measurement_id: int) -> bool:
-    """True if since this measurement there was no other one, no move, and no declared position.
+    """True if since this measurement there was no other one, no move, no declared position, and
+    no slice of another study, frame of reference or protocol.
 
     A robot that was restarted counts from zero wherever it stands: that its positions are the same
     numbers as before says nothing then.
@@ -47,13 +75,26 @@ def is_untouched(record: CaseRecord, measurement_id: int) -> bool:
     newest = record.last_measurement("done")
     if newest is not None and newest.measurement_id != measurement_id:
         return False
-    since = record.measurement(measurement_id).requested_seq
-    if not record.measurement(measurement_id).finished_seq:
+    measurement = record.measurement(measurement_id)
+    since = measurement.requested_seq
+    if not measurement.finished_seq or _is_another_scan(record, measurement):
         return False
     declared = record.last_event(POSITION_DECLARED)
     if declared is not None and declared.seq > since:
         return False
     return record.last_sent_seq() <= since
+
+
+def _is_another_scan(record: CaseRecord, measurement: Measurement) -> bool:
+    frame, newest = frame_of(record, measurement), newest_frame(record)
+    if frame is None or newest is None:
+        return False
+    since = measurement.requested_seq
+    return bool(
+        frame.other_protocol(newest)
+        or other_place_since(record, since, frame)
+        or other_study_held_since(record, since)
+    )
 
 
 def positions_to_declare(record: CaseRecord, positions_um: Mapping[str, int]) -> dict[str, int]:

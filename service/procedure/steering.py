@@ -15,14 +15,20 @@ from numpy.typing import NDArray
 
 from service.procedure.calibration import Calibration, learn_from_move
 from service.procedure.estimate import FiducialEstimate
+from service.procedure.identity import PROOF, moved_visibly, proof_plan
 from service.procedure.plan import Plan, PlanPart, PlanRefusedError, Travel, plan_move
-from service.procedure.sensing import ProcedureFailedError, ValidationGate, check_prediction, move
-from service.procedure.steps import Answered, AskOperator, MoveTo, ProcedureSteps, ask
+from service.procedure.sensing import (
+    ProcedureFailedError,
+    ValidationGate,
+    ask_to_confirm,
+    check_prediction,
+    move,
+)
+from service.procedure.steps import MoveTo, ProcedureSteps
 from service.procedure.strategies import Strategy, Way
 
-CONFIRM = "confirm"
-REJECT = "reject"
 _LOOSE_MM = 0.25
+_MOST_PROOFS = 2
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -30,7 +36,9 @@ class SteeringArguments:
     """What every approach is told.
 
     target_mm: in the image plane of the calibration, as the estimate has it. travel_um: lowest and
-    highest setpoint of each axis. most_frames: slices at one position at the most.
+    highest setpoint of each axis. most_frames: slices at one position at the most. proven: what is
+    measured was seen to move with the robot, see `identity`; otherwise READY is said only after a
+    move that shows it.
     """
 
     target_mm: tuple[float, ...]
@@ -40,6 +48,7 @@ class SteeringArguments:
     max_iterations: int
     confirm_moves: bool
     gate: ValidationGate
+    proven: bool = True
     most_frames: int = 6
 
     @property
@@ -51,6 +60,7 @@ class AnyLook(Protocol):
     """What was seen from where the robot stands now.
 
     found: from this look alone; prior: what was believed before it; frames: slices that it took.
+    after_loss: at first it was not found.
     """
 
     @property
@@ -67,6 +77,9 @@ class AnyLook(Protocol):
 
     @property
     def scan_s(self) -> float: ...
+
+    @property
+    def after_loss(self) -> bool: ...
 
 
 LookT = TypeVar("LookT", bound=AnyLook)
@@ -110,7 +123,8 @@ class Steered(Protocol[LookT]):
 class Standing(Generic[LookT]):
     """Where an approach stands.
 
-    seen: the last look, if the robot has not moved since; iterations: moves made so far.
+    seen: the last look, if the robot has not moved since; iterations: moves made so far, `proofs`
+    of them to prove what is seen; proven: it was seen to move with the robot.
     """
 
     calibration: Calibration
@@ -119,13 +133,15 @@ class Standing(Generic[LookT]):
     frames: int = 0
     scan_s: float = 0.0
     iterations: int = 0
+    proofs: int = 0
+    proven: bool = True
 
 
 def steer(steered: Steered[LookT], start: Calibration) -> ProcedureSteps[Standing[LookT]]:
     """Bring it to its target; raises ProcedureFailedError when that does not succeed."""
     arguments, strategy = steered.arguments, steered.strategy
     way = strategy.coarse
-    standing: Standing[LookT] = Standing(start)
+    standing: Standing[LookT] = Standing(start, proven=arguments.proven)
     if not strategy.fuses or _is_loose(start.estimate, arguments.tolerance_mm):
         standing = yield from _look(steered, standing, way)
     while True:
@@ -133,12 +149,16 @@ def steer(steered: Steered[LookT], start: Calibration) -> ProcedureSteps[Standin
             standing = yield from _look_longer(steered, standing)
         if steered.is_there(standing.calibration, way):
             if standing.seen is not None and way is strategy.fine:
-                return standing
+                if standing.proven:
+                    return standing
+                standing = yield from _prove(steered, standing, way)
+                continue
             # never READY on a prediction, nor (hybrid) on the coarse image
             way = strategy.fine
             standing = yield from _look(steered, standing, way)
             continue
-        if standing.iterations == arguments.max_iterations:
+        # a proof move and the way back from it are not counted
+        if standing.iterations >= arguments.max_iterations + 2 * standing.proofs:
             raise ProcedureFailedError(
                 "not_converged",
                 f"the target was not reached in {arguments.max_iterations} moves: "
@@ -146,8 +166,33 @@ def steer(steered: Steered[LookT], start: Calibration) -> ProcedureSteps[Standin
             )
         plan = _plan(steered, standing)
         if arguments.confirm_moves:
-            yield from _ask_to_confirm(steered.name, plan)
+            yield from ask_to_confirm(steered.name, plan)
         standing = yield from _go(steered, standing, plan, way)
+
+
+def _prove(
+    steered: Steered[LookT], standing: Standing[LookT], way: Way
+) -> ProcedureSteps[Standing[LookT]]:
+    """Move by part of a pixel: what is seen must go with it; raises ProcedureFailedError if not."""
+    if standing.proofs == _MOST_PROOFS:
+        text = f"the {steered.name} was not seen to move with the robot: is it in the slice?"
+        raise ProcedureFailedError("identity", text)
+    calibration = standing.calibration
+    plan_id = f"{calibration.measurement_id}.{standing.iterations}"
+    try:
+        plan = proof_plan(calibration, steered.arguments.travel, plan_id)
+    except PlanRefusedError as error:
+        raise ProcedureFailedError("target_out_of_reach", str(error)) from error
+    if steered.arguments.confirm_moves:
+        yield from ask_to_confirm(f"{steered.name}, to see it follow,", plan)
+    standing = replace(standing, proofs=standing.proofs + 1)
+    try:
+        return (yield from _go(steered, standing, plan, way, PROOF))
+    except ProcedureFailedError as error:
+        if error.code != "prediction_missed":
+            raise
+        text = f"what is seen does not move with the robot, it is not the fiducial: {error}"
+        raise ProcedureFailedError("identity", text) from error
 
 
 def _is_loose(estimate: FiducialEstimate, tolerance_mm: float) -> bool:
@@ -170,6 +215,8 @@ def _look(
         frames=standing.frames + seen.frames,
         scan_s=standing.scan_s + seen.scan_s,
     )
+    if seen.after_loss:
+        there = replace(there, proven=False)
     return _believing(there, seen, fuses=steered.strategy.fuses)
 
 
@@ -220,17 +267,12 @@ def _plan(steered: Steered[LookT], standing: Standing[LookT]) -> Plan:
     return replace(plan, displacement_mm=(row, col), parts=steered.parts(calibration.estimate))
 
 
-def _ask_to_confirm(name: str, plan: Plan) -> ProcedureSteps[None]:
-    """Wait for the operator; raises ProcedureFailedError unless the plan is confirmed."""
-    row, col = plan.displacement_mm
-    question = f"Move the {name} by ({row:+.3f}, {col:+.3f}) mm (row, col)?"
-    answer = yield from ask(AskOperator(question, (CONFIRM, REJECT), plan.to_json()), Answered)
-    if answer.choice != CONFIRM:
-        raise ProcedureFailedError("rejected", f"the move was rejected by {answer.who}")
-
-
 def _go(
-    steered: Steered[LookT], standing: Standing[LookT], plan: Plan, way: Way
+    steered: Steered[LookT],
+    standing: Standing[LookT],
+    plan: Plan,
+    way: Way,
+    purpose: str = "approach",
 ) -> ProcedureSteps[Standing[LookT]]:
     """Carry out the plan, look, and learn from the move."""
     calibration, noise = standing.calibration, steered.arguments.gate.noise
@@ -238,7 +280,7 @@ def _go(
     moved = yield from move(
         MoveTo(
             dict(plan.setpoints_um),
-            "approach",
+            purpose,
             rests_on=plan.measurement_id,
             from_um=dict(plan.from_um),
         )
@@ -251,6 +293,9 @@ def _go(
         iterations=standing.iterations + 1,
     )
     after = yield from _look(steered, there, way)
+    if standing.seen is not None and after.seen is not None and not after.seen.after_loss:
+        followed = moved_visibly(before, after.seen.found)
+        after = replace(after, proven=after.proven or followed)
     if not steered.strategy.fuses or after.seen is None:
         return after
     jacobian = learn_from_move(calibration.jacobian, before, after.seen.found, noise)

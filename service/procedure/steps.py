@@ -98,7 +98,10 @@ class Acquired:
 
 @dataclass(frozen=True)
 class Measured:
-    """A measurement that succeeded (`reason_code` empty) or the reason why it did not."""
+    """A measurement that succeeded (`reason_code` empty) or the reason why it did not.
+
+    after_loss: a try before it, at the same place, did not find the fiducial.
+    """
 
     measurement_id: int
     reason_code: str = ""
@@ -108,6 +111,7 @@ class Measured:
     plane: Mapping[str, Any] = field(default_factory=dict)
     frames: int = 0
     scan_s: float = 0.0
+    after_loss: bool = False
 
     @property
     def ok(self) -> bool:

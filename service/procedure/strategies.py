@@ -78,6 +78,10 @@ class Look:
         return self.measured.frames
 
     @property
+    def after_loss(self) -> bool:
+        return self.measured.after_loss
+
+    @property
     def scan_s(self) -> float:
         return self.measured.scan_s
 

@@ -8,7 +8,7 @@ beside it by the oil-water shift of the slices, which follows from their header.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
@@ -19,6 +19,7 @@ from case_record.rows import Event
 from service.procedure.guide_geometry import GuideGeometry, state_on_line
 from service.procedure.kinematics import KinematicsError, line_from_entry_and_target
 from service.procedure.plane import ImagePlane
+from service.procedure.scan_frame import ScanFrame, other_place_since
 
 Array = NDArray[np.float64]
 TARGET_SET, TARGET_WITHDRAWN = "target_set", "target_withdrawn"
@@ -32,12 +33,18 @@ class TargetError(ValueError):
 
 @dataclass(frozen=True)
 class Target:
-    """patient_mm: LPS; `number` is that of the event by which it was set."""
+    """patient_mm: LPS; `number` is that of the event by which it was set.
+
+    frame: of the slices on which it was set, as of `frame_seq` in the order of the record; None:
+    before any slice, or in the record of an older program.
+    """
 
     number: int
     patient_mm: tuple[float, float, float]
     label: str = ""
     in_water: bool = False
+    frame: ScanFrame | None = None
+    frame_seq: int = field(default=0, compare=False)
 
 
 def current_target(record: CaseRecord) -> Target | None:
@@ -71,8 +78,27 @@ def all_targets(record: CaseRecord) -> list[Target]:
 
 def target_of(event: Event) -> Target:
     x, y, z = event.body["patient_mm"]
+    frame = event.body.get("scan_frame")
     return Target(
-        event.event_id, (x, y, z), event.body.get("label", ""), event.body.get("in_water", False)
+        event.event_id,
+        (x, y, z),
+        event.body.get("label", ""),
+        event.body.get("in_water", False),
+        None if frame is None else ScanFrame(**frame),
+        event.body.get("scan_frame_seq", event.seq),
+    )
+
+
+def why_void_target(record: CaseRecord, target: Target) -> str:
+    """Why a target is not where the anatomy is any more; empty if nothing says so."""
+    if target.frame is None:
+        return ""
+    other = other_place_since(record, target.frame_seq, target.frame)
+    if not other:
+        return ""
+    return (
+        f"slices of {other} have come since the target was set, the table may have moved: "
+        "pick it again on the new slices"
     )
 
 
@@ -111,9 +137,21 @@ def fiducial_must_appear_at(
 ) -> Array:
     """Where in the image plane, mm (2,), the fiducial is seen when it is at the target."""
     place = plane.from_patient(target.patient_mm)
-    if not target.in_water:
+    if target.in_water:
+        return place + oil_shift_mm(header, plane.spacing_mm, polarity)
+    if target.frame is None or not header:
         return place
-    return place + oil_shift_mm(header, plane.spacing_mm, polarity)
+    other = target.frame.other_protocol(ScanFrame.of_header(header))
+    if not other:
+        return place
+    # it was set where oil appeared in other slices: in these the same place appears elsewhere
+    try:
+        now = oil_shift_mm(header, plane.spacing_mm, polarity)
+        return place + now - oil_shift_mm(vars(target.frame), plane.spacing_mm, polarity)
+    except TargetError as error:
+        raise TargetError(
+            f"it was set on other slices, the newest have {other}: {error}; set it again on these"
+        ) from error
 
 
 @dataclass(frozen=True, eq=False)

@@ -9,6 +9,20 @@ from service.room.state import RoomState
 
 HANGS = "is not responding"
 
+# a procedure that the operator ended is no alarm
+_CHOSEN = frozenset({"rejected"})
+_AFTER_FAILURE = {
+    "prediction_missed": "See whether something pushed the guide, then calibrate again.",
+    "identity": "Look for the fiducial in the slice and check the slice position; then calibrate.",
+    "not_converged": "Start the approach again; if it fails again, calibrate.",
+    "target_out_of_reach": "Set another target, or place the robot anew and calibrate.",
+    "other_place": "Set the target anew on the new slices; calibrate again where asked to.",
+    "other_protocol": "Start it again with these slices, or scan with the protocol of before.",
+    "plane_changed": "Scan with the orientation of the calibration, then start it again.",
+    "calibration": "See that every axis moves the guide, then calibrate again.",
+    "plan_void": "Start the approach again: it measures and plans anew.",
+}
+
 
 def conditions(state: RoomState) -> list[Condition]:
     """What is wrong now, most urgent first; each with what to do about it."""
@@ -43,6 +57,13 @@ def conditions(state: RoomState) -> list[Condition]:
         text = f"READY was lost: {state.ready_lost.text}"
         what = "Confirm that the needle is withdrawn, then start the approach: it measures again."
         found.append(Condition("ready_lost", "alarm", text, what))
+    if state.target_lost is not None:
+        text = f"The target is void: {state.target_lost.text}"
+        found.append(Condition("target_void", "alarm", text, "Pick the target on the new slices."))
+    if state.last_failure is not None and state.last_failure not in _CHOSEN:
+        what = _AFTER_FAILURE.get(state.last_failure, "Read the reason, then start it again.")
+        text = state.last_outcome[:1].upper() + state.last_outcome[1:].replace("_", " ")
+        found.append(Condition("procedure_failed", "alarm", text, what))
     for process in state.processes:
         if process.condition == "down" or process.detail == HANGS:
             text = f"The {process.name} {process.detail}"

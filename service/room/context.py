@@ -13,14 +13,15 @@ from room_config.load import Config
 from room_config.service import GuideConfig
 from service.procedure.calibration import Calibration
 from service.procedure.fiducial_plan import gate_of
+from service.procedure.identity import ProofArguments
 from service.procedure.plan import Travel
 from service.procedure.registry import latest_calibration
-from service.procedure.start_point import start_point
+from service.procedure.start_point import is_proven, start_point
 from service.room.belief.goal import effective
 from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
-from service.room.present import Now
+from service.room.present import RESTS_ON, Now
 from service.room.readiness import ConflictError
 from service.room.stop_latch import StopLatch
 
@@ -100,7 +101,27 @@ class Room:
         """The calibration with the estimate carried to where the robot stands now."""
         calibration = latest_calibration(self.record, guide=guide)
         if calibration is None:
-            raise ConflictError("not_calibrated", "Calibrate first.")
+            raise ConflictError(
+                "not_calibrated",
+                "Calibrate first (a new frame of reference voids the calibration before).",
+            )
         status = self.linked()
         noise = gate_of(self.config).noise
-        return start_point(self.record, calibration, status.positions_um, noise)
+        stood = self._has_stood(calibration.measurement_id)
+        return start_point(self.record, calibration, status.positions_um, noise, stood=stood)
+
+    def _has_stood(self, measurement_id: int) -> bool:
+        """Whether the bridge knows of no motion since a measurement, parking and restarts too."""
+        facts = self.record.measurement(measurement_id).request.get(RESTS_ON, {})
+        status = self.linked()
+        then = (facts.get("boot_id"), facts.get("last_motion"))
+        return then == (status.boot_id, status.last_motion)
+
+    def is_proven(self, start: Calibration) -> bool:
+        """Whether what a start point says was seen to move with the robot, and not lost since."""
+        stood = self._has_stood(start.measurement_id)
+        return stood and is_proven(self.record, start, self.linked().positions_um)
+
+    def proof_arguments(self, start: Calibration) -> ProofArguments:
+        confirm, travel_um = self.config.service.confirm_moves, self.link.travel_um
+        return ProofArguments(self.is_proven(start), dict(travel_um), confirm)

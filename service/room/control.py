@@ -29,6 +29,7 @@ from service.procedure.guide_recording import GuidePlace
 from service.procedure.recording import Place
 from service.procedure.registry import build_procedure, result_to_json
 from service.procedure.runner import ReplayMismatchError, run_procedure
+from service.procedure.scan_frame import frame_of
 from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steps import Outcome, Step
 from service.procedure.targets import ENTRY_SET, TARGET_SET
@@ -271,7 +272,9 @@ class ControlLoop:
             raise  # the procedure stays `running`: the next start goes on with it
         except ProcedureAbortedError as error:
             self._end_procedure(running, "aborted", str(error))
-        except (ProcedureFailedError, ReplayMismatchError) as error:
+        except ProcedureFailedError as error:
+            self._end_procedure(running, "failed", str(error), error.code)
+        except ReplayMismatchError as error:
             self._end_procedure(running, "failed", str(error))
         except RECORD_FAULTS as error:
             # the record could be written in between, and yet: then it is not the record's fault
@@ -297,10 +300,11 @@ class ControlLoop:
         text = f"the program failed ({type(error).__name__}: {error}); its log says where"
         self._end_procedure(running, "failed", text)
 
-    def _end_procedure(self, running: Procedure, state: str, reason: str) -> None:
+    def _end_procedure(self, running: Procedure, state: str, reason: str, code: str = "") -> None:
         body = {"procedure_id": running.procedure_id, "name": running.name, "reason": reason}
+        result = {"reason": reason, "code": code}
         with self._record.transaction():
-            self._record.end_procedure(running.procedure_id, state, {"reason": reason})
+            self._record.end_procedure(running.procedure_id, state, result)
             self._record.append_event(f"procedure_{state}", body, source="service")
 
     def _finish_procedure(self, running: Procedure, result: Any) -> None:
@@ -335,6 +339,9 @@ class ControlLoop:
             "procedure_id": recorded.procedure_id,
             "sigma_mm": place.to_json()["sigma_mm"],
         }
+        frame = frame_of(self._record, self._record.measurement(place.calibration.measurement_id))
+        if frame is not None:
+            body["scan_frame"] = frame.to_json()
         self._record.append_event(TARGET_SET, body, source="service", who=who)
 
     def _tick(self) -> None:

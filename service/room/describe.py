@@ -9,9 +9,15 @@ from typing import Any
 from case_record.cases import Cases
 from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
-from case_record.rows import Measurement, SliceRow
+from case_record.rows import Measurement, Procedure, SliceRow
 from room_config.load import Config
-from service.procedure.targets import current_entry, current_target
+from service.procedure.targets import (
+    Target,
+    TargetError,
+    current_entry,
+    current_target,
+    why_void_target,
+)
 from service.room.alarms import AlarmBook, Condition
 from service.room.belief.describe import describe_belief
 from service.room.belief.goal import effective, goal_tolerance_mm
@@ -25,16 +31,18 @@ from service.room.describe_measurement import (
     describe_reconstruction,
 )
 from service.room.execution import Execution
+from service.room.history import arrival_by_hand, rests_on_slices
 from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
 from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
-from service.room.prompt import is_calibrated, is_punctured, outcome_text, prompt
+from service.room.prompt import is_calibrated, is_punctured, next_action, outcome_text, prompt
 from service.room.proposals import ProposalBook
 from service.room.scanner_clock import clock_update
 from service.room.state import (
     AcquisitionState,
     ArrivalState,
     CaseState,
+    DriveState,
     FiducialState,
     HoldState,
     LostState,
@@ -80,7 +88,8 @@ class Describer:
         settings = effective(config, record)
         case = record.case()
         target = current_target(record)
-        target_mm = list(target.patient_mm) if target else None
+        void = why_void_target(record, target) if target else ""
+        target_mm = list(target.patient_mm) if target and not void else None
         measurement = record.last_measurement()
         now = now_of(config, link)
         found = readiness(record, now)
@@ -91,9 +100,11 @@ class Describer:
                 "case_uid": case.case_uid if case else "",
                 "case": _case(record),
                 **_procedures(record, execution),
-                "prompt": prompt(config, record, link, execution, found),
+                "prompt": prompt(config, record, link, execution, found) + _marked(arrival),
                 "ready": arrival is not None,
                 "ready_lost": _lost_ready(found),
+                "next_action": next_action(config, record, link, execution, found),
+                "calibration_drives": _drives(config, link),
                 "arrival": arrival,
                 "punctured": found is not None and is_punctured(record, found.procedure_id),
                 "robot": describe_robot(link, before.robot),
@@ -106,7 +117,8 @@ class Describer:
                 "calibrated": is_calibrated(config, record),
                 "target_patient_mm": tuple(target_mm) if target_mm else None,
                 "entry_patient_mm": current_entry(record),
-                **_error(settings, record, target_mm, now),
+                "target_lost": LostState(code="target_void", text=void) if void else None,
+                **_error(settings, record, None if void else target, void, now),
                 "event_id": record.last_event_id(),
                 "processes": self._look_at_processes(),
                 "proposals": self._proposals.update(record),
@@ -191,11 +203,19 @@ def _procedures(record: CaseRecord, execution: Execution) -> dict[str, Any]:
         "procedure": running.name if running else None,
         "procedure_id": running.procedure_id if running else None,
         "last_outcome": outcome_text(ended.name, ended.state, ended.result) if ended else "",
+        "last_failure": _failure(ended) if running is None else None,
         "acquisition_request": AcquisitionState(**vars(request)) if request else None,
         "question": QuestionState(**{**vars(question), "choices": list(question.choices)})
         if question
         else None,
     }
+
+
+def _failure(ended: Procedure | None) -> str | None:
+    """The code of the failure with which the last procedure ended; None unless it failed."""
+    if ended is None or ended.state != "failed":
+        return None
+    return str((ended.result or {}).get("code", ""))
 
 
 def _case(record: CaseRecord) -> CaseState | None:
@@ -244,7 +264,31 @@ def _arrival(record: CaseRecord, found: Readiness | None, now: Now) -> ArrivalSt
     known = {name: result[name] for name in ArrivalState.model_fields if name in result}
     measurement = record.measurement(int(result["measurement_id"]))
     age = age_s(measurement.request[RESTS_ON], now)
-    return ArrivalState(procedure_id=found.procedure_id, **{**known, "age_s": age})
+    by_hand = arrival_by_hand(record, found.procedure_id)
+    more = {"age_s": age, "by_hand": by_hand}
+    return ArrivalState(procedure_id=found.procedure_id, **{**known, **more})
+
+
+def _marked(arrival: ArrivalState | None) -> str:
+    """An overrule is never out of sight where READY rests on it."""
+    return "" if arrival is None or not arrival.by_hand else " (rests on slices used by hand)"
+
+
+def _drives(config: Config, link: RoomLink) -> list[DriveState]:
+    """What a calibration would drive, and how far: said before it is ordered."""
+    status = link.status
+    if status is None:
+        return []
+    guide = config.service.guide
+    axes = config.service.axes if guide is None else guide.axes
+    move_mm = (guide or config.service).calibration_move_mm
+    drives = []
+    for axis in axes:
+        low_um, high_um = link.travel_um.get(axis, (0, 0))
+        middle_mm = (low_um + high_um) // 2 / 1000
+        stops_mm = (status.positions_um.get(axis, 0) / 1000, middle_mm, middle_mm + move_mm)
+        drives.append(DriveState(axis=axis, stops_mm=(*stops_mm, middle_mm)))
+    return drives
 
 
 def _lost_ready(found: Readiness | None) -> LostState | None:
@@ -261,6 +305,7 @@ def _measurement(record: CaseRecord, last: Measurement | None, now: Now) -> Meas
     update = {
         "lost": None if lost is None else LostState(code=lost.code, text=lost.text),
         "age_s": None if facts is None else age_s(facts, now),
+        "by_hand": rests_on_slices(last, record.slices_by_hand()),
     }
     return describe_measurement(last).model_copy(update=update)
 
@@ -275,18 +320,21 @@ def _other(record: CaseRecord, other: FiducialState | None, now: Now) -> Fiducia
 
 
 def _error(
-    config: Config, record: CaseRecord, target_mm: list[float] | None, now: Now
+    config: Config, record: CaseRecord, target: Target | None, void: str, now: Now
 ) -> dict[str, Any]:
     """How far off it is now; if that is not known, why not."""
     last = record.last_measurement("done")
     if last is None:
         return {"error": None, "error_reason": "nothing was measured yet"}
-    if target_mm is None:
-        return {"error": None, "error_reason": "no target is set"}
     lost = why_not_now(record, last, now)
     if lost is not None:
         return {"error": None, "error_reason": lost.text}
-    error = describe_error(config, record, target_mm)
+    if target is None:
+        return {"error": None, "error_reason": void or "no target is set"}
+    try:
+        error = describe_error(config, record, target)
+    except TargetError as unusable:
+        return {"error": None, "error_reason": str(unusable)}
     return {"error": error, "error_reason": "" if error else "not calibrated"}
 
 

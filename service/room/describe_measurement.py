@@ -13,6 +13,7 @@ from dicom_slice.geometry import SliceGeometry
 from room_config.load import Config
 from service.procedure.estimate import axis_sigma, probability_within
 from service.procedure.registry import latest_calibration
+from service.procedure.targets import Target, fiducial_must_appear_at
 from service.room.state import ErrorState, FiducialState, MeasurementState, ReconstructionState
 
 _LOOKED_BACK = 24
@@ -105,15 +106,20 @@ def _geometry(row: SliceRow) -> SliceGeometry:
     return SliceGeometry(**{k: tuple(v) for k, v in row.header["geometry"].items()})
 
 
-def describe_error(
-    config: Config, record: CaseRecord, target_mm: list[float] | None
-) -> ErrorState | None:
-    """The error by the newest measurement alone (the procedure also knows the moves before)."""
+def describe_error(config: Config, record: CaseRecord, target: Target | None) -> ErrorState | None:
+    """The error by the newest measurement alone (the procedure also knows the moves before).
+
+    Raises TargetError where it is not known where the fiducial appears when it is at the target.
+    """
     last = record.last_measurement(state="done")
     calibration = latest_calibration(record)
-    if last is None or last.result is None or target_mm is None or calibration is None:
+    if last is None or last.result is None or target is None or calibration is None:
         return None
-    offset = calibration.plane.from_patient(target_mm) - np.array(last.result["plane_mm"])
+    header = record.slice(int(last.result["slice_id"])).header
+    must_be = fiducial_must_appear_at(
+        target, calibration.plane, header, config.imaging.readout_polarity
+    )
+    offset = must_be - np.array(last.result["plane_mm"])
     covariance = np.array(last.result["covariance_mm2"])
     spacing = np.array(calibration.plane.spacing_mm)
     target_px = np.array(last.result["centre_px"]) + offset / spacing

@@ -8,15 +8,15 @@ from dataclasses import dataclass
 from typing import Any
 
 from case_record.record import CaseRecord
-from case_record.rows import Hold
+from case_record.rows import Hold, Measurement
 from robot_bridge.client.client import BridgeStatus, LinkLostError, MoveOutcome, RefusedError
 from robot_bridge.protocol.messages import Code, CommandState
 from robot_bridge.protocol.phases import WorkPhase, motion_allowed
 from room_config.load import Config
 from service.procedure.plan import PLAN_VOID, why_void
 from service.procedure.runner import measurement_name
-from service.procedure.sensing import ABORT
-from service.procedure.steering import CONFIRM
+from service.procedure.scan_frame import ScanFrame, frame_of
+from service.procedure.sensing import ABORT, CONFIRM, ProcedureFailedError
 from service.procedure.steps import (
     Acquire,
     Acquired,
@@ -158,7 +158,12 @@ class Execution:
             try:
                 if not self._stands_in_motion_phase(phase):
                     self._link.enter_phase(phase, _SERVICE)
-                outcome = self._link.client.move(command_id, step.setpoints_um, measurement)
+                outcome = self._link.client.move(
+                    command_id,
+                    step.setpoints_um,
+                    measurement,
+                    based_on_motion=self._based_on_motion(step),
+                )
             except LinkLostError as error:
                 self._link.lost(error)
                 self._permitted.interrupt()
@@ -166,6 +171,16 @@ class Execution:
             except RefusedError as error:
                 outcome = MoveOutcome(command_id, CommandState.REFUSED, error.code, error.text, {})
             return self._settled(step, outcome)
+
+    def _based_on_motion(self, step: MoveTo) -> str | None:
+        """The motion after which the measurement was taken on which a move rests; of one that
+        rests on none, the last one. None where the record does not say.
+        """
+        if step.rests_on is None:
+            status = self._link.status
+            return None if status is None else status.last_motion
+        facts = self._record.measurement(step.rests_on).request.get(RESTS_ON)
+        return None if facts is None else str(facts["last_motion"])
 
     def _why_void(self, step: MoveTo, command_id: str) -> str:
         """Why the plan behind a move is void; a move that was sent is only asked for again."""
@@ -353,7 +368,31 @@ class Execution:
             self._wait()
         if measurement.state == "failed" or measurement.result is None:
             return Measured(number, measurement.reason_code or "failed", measurement.reason)
+        self._check_scan_frame(measurement)
         return measured_from_result(number, measurement.result)
+
+    def _check_scan_frame(self, measurement: Measurement) -> None:
+        """Raise ProcedureFailedError for slices that are not as those that it rests on."""
+        here, expected = frame_of(self._record, measurement), self._scan_frame_before(measurement)
+        if here is None or expected is None:
+            return
+        if other := expected.other_place(here):
+            text = f"the slices are of {other}: the table may have moved. Set the target anew"
+            raise ProcedureFailedError("other_place", text)
+        if other := expected.other_protocol(here):
+            text = f"the slices have {other}: oil appears elsewhere in them. Start anew with these"
+            raise ProcedureFailedError("other_protocol", text)
+
+    def _scan_frame_before(self, measurement: Measurement) -> ScanFrame | None:
+        """What the running procedure was begun with, or measured first."""
+        running = self._record.running_procedure()
+        if running is None:
+            return None
+        begun_with = running.arguments.get("scan_frame")
+        if begun_with is not None:
+            return ScanFrame(**begun_with)
+        first = self._record.first_measurement_since(running.begun_seq)
+        return None if first is None else frame_of(self._record, first)
 
     def _linked(self) -> BridgeStatus:
         """The bridge's status; waits for the link, for what is measured is of a robot that stands

@@ -15,20 +15,25 @@ from case_record.record import FILE_NAME, CaseRecord, CaseRecordError
 from case_record.rows import Measurement
 from service.procedure.estimate import axis_sigma
 from service.procedure.plane import ImagePlane
-from service.procedure.registry import APPROACHES
+from service.procedure.registry import APPROACHES, CALIBRATIONS
 from service.procedure.targets import TARGET_SET, TARGET_WITHDRAWN, current_target, target_of
 from service.room.summaries import CaseSummary, KnownTarget, MeasurementBody
 
 
 @dataclass(frozen=True)
 class Targets:
-    """Since when which target (patient mm) was set, oldest first; None: it was withdrawn."""
+    """Since when which target (patient mm) was set, oldest first; None: it was withdrawn.
 
-    since_s: tuple[float, ...]
+    by_hand: the used slices that a person assigned.
+    """
+
+    since_seq: tuple[int, ...]
     patient_mm: tuple[tuple[float, float, float] | None, ...]
+    by_hand: frozenset[int] = frozenset()
 
-    def at(self, instant_s: float) -> tuple[float, float, float] | None:
-        place = bisect_right(self.since_s, instant_s)
+    def at(self, seq: int) -> tuple[float, float, float] | None:
+        """The target that was set at this place in the order of the record."""
+        place = bisect_right(self.since_seq, seq)
         return self.patient_mm[place - 1] if place else None
 
     def body_of(self, row: Measurement) -> MeasurementBody:
@@ -49,12 +54,13 @@ class Targets:
             error_mm=self._error_mm(row),
             snr=found.get("snr"),
             has_reconstruction=bool(found.get("reconstruction")),
+            by_hand=rests_on_slices(row, self.by_hand),
         )
 
     def _error_mm(self, row: Measurement) -> float | None:
         if row.request.get("slice_position_mm") is not None:
             return None  # one of two fiducials: the target is the needle's, not this one's
-        target = self.at(row.requested_s)
+        target = self.at(row.requested_seq)
         if target is None or not row.result:
             return None
         plane = ImagePlane.from_json(row.result["plane"])
@@ -89,8 +95,36 @@ def targets_over_time(record: CaseRecord) -> Targets:
     events = [*record.events_of_kind(TARGET_SET), *record.events_of_kind(TARGET_WITHDRAWN)]
     events.sort(key=lambda event: event.event_id)
     return Targets(
-        tuple(event.wall_s for event in events),
+        tuple(event.seq for event in events),
         tuple(target_of(e).patient_mm if e.kind == TARGET_SET else None for e in events),
+        record.slices_by_hand(),
+    )
+
+
+def rests_on_slices(measurement: Measurement, slice_ids: frozenset[int]) -> bool:
+    """Whether any of these slices was measured."""
+    return not slice_ids.isdisjoint((measurement.result or {}).get("slice_ids", ()))
+
+
+def arrival_by_hand(record: CaseRecord, procedure_id: int) -> bool:
+    """Whether an approach's end rests on a slice that a person assigned: in the approach itself,
+    in its calibration, or in anything measured between them.
+    """
+    by_hand = record.slices_by_hand()
+    if not by_hand:
+        return False
+    arrival = record.procedure(procedure_id)
+    calibrations = [
+        row.begun_seq
+        for row in record.procedures()
+        if row.name in CALIBRATIONS and row.state == "done" and row.begun_seq < arrival.begun_seq
+    ]
+    since = max(calibrations, default=0)
+    return any(
+        since < row.requested_seq
+        and (row.requested_seq < arrival.ended_seq or not arrival.ended_seq)
+        for row in record.measurements("done")
+        if rests_on_slices(row, by_hand)
     )
 
 

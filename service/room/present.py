@@ -24,8 +24,13 @@ from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Event, Measurement
 from robot_bridge.client.client import BridgeStatus
 from service.procedure.plan import SAME_PLACE_UM
-from service.procedure.scan_frame import ScanFrame
-from service.procedure.targets import current_entry_number, current_target
+from service.procedure.scan_frame import (
+    ScanFrame,
+    frame_of,
+    other_place_since,
+    other_study_held_since,
+)
+from service.procedure.targets import current_entry_number, current_target, why_void_target
 from service.room.readiness import ready_arrival
 
 READY, READY_LOST = "ready", "ready_lost"
@@ -192,6 +197,8 @@ def _target_changed(record: CaseRecord, approach: Mapping[str, Any]) -> Lost | N
             return Lost("target_withdrawn", "the target was withdrawn since")
         if target.number != approach["target"]:
             return Lost("target_changed", "the target was changed since")
+        if why := why_void_target(record, target):
+            return Lost("target_void", why)
     if "entry" in approach and current_entry_number(record) != approach["entry"]:
         return Lost("target_changed", "the entry point was changed since")
     return None
@@ -216,13 +223,21 @@ def _robot_changed(facts: Mapping[str, Any], now: Now) -> Lost | None:
     )
 
 
+# what moves a robot besides commands, as the bridge names it in `last_motion`
+_MOTIONS = {
+    "declared": Lost("declared", "measured before the robot's position was declared"),
+    "parked": Lost("parked", "measured before the drives were parked"),
+    "lost": Lost("position", "the robot's position became uncertain since"),
+    "stray": Lost("stray", "an axis has moved without a command since"),
+}
+
+
 def _moved(facts: Mapping[str, Any], status: BridgeStatus) -> Lost | None:
     if facts["boot_id"] != status.boot_id:
         return Lost("bridge_restarted", "measured before the robot's bridge was restarted")
     if status.last_motion != facts["last_motion"]:
-        if status.last_motion.startswith("declared:"):
-            return Lost("declared", "measured before the robot's position was declared")
-        return Lost("moved", "measured before the last move")
+        what = status.last_motion.partition(":")[0]
+        return _MOTIONS.get(what, Lost("moved", "measured before the last move"))
     return Lost("moving", "the robot moves") if status.moving else None
 
 
@@ -258,17 +273,17 @@ def _elsewhere(facts: Mapping[str, Any], status: BridgeStatus) -> Lost | None:
 
 def _scanner_changed(record: CaseRecord, measurement: Measurement) -> Lost | None:
     """Slices that came since, used or not, of another study, frame of reference or protocol."""
-    result = measurement.result or {}
-    if "slice_id" not in result:
+    seen, since = frame_of(record, measurement), measurement.requested_seq
+    if seen is None:
         return None
-    seen = ScanFrame.of_header(record.slice(int(result["slice_id"])).header)
-    for state, header in record.scans_since(measurement.requested_seq):
-        came = ScanFrame.of_header(header)
-        if other := seen.other_place(came):
-            text = f"slices of {other} have come since: the table may have moved"
-            return Lost("other_place", text)
-        other = seen.other_protocol(came)
-        if state == "assigned" and other:
+    other = other_place_since(record, since, seen)
+    if not other and other_study_held_since(record, since):
+        other = "another study"
+    if other:
+        return Lost("other_place", f"slices of {other} have come since: the table may have moved")
+    for came in record.scans_since(since):
+        other = seen.other_protocol(ScanFrame.of_header(came))
+        if came["state"] == "assigned" and other:
             return Lost("other_protocol", f"slices with {other} have come since")
     return None
 

@@ -8,8 +8,8 @@ from case_record.record import CaseRecord
 from robot_bridge.client.client import BridgeStatus
 from robot_bridge.protocol.phases import WorkPhase
 from room_config.load import Config
-from service.procedure.registry import CALIBRATION, GUIDE_CALIBRATION
-from service.procedure.targets import current_entry, current_target
+from service.procedure.registry import latest_calibration
+from service.procedure.targets import current_entry, current_target, why_void_target
 from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.present import Readiness
@@ -45,8 +45,11 @@ def _idle_prompt(
         return "Arm the robot."
     if not is_calibrated(config, record):
         return "Start the calibration."
-    if current_target(record) is None:
+    target = current_target(record)
+    if target is None:
         return "Set a target."
+    if why := why_void_target(record, target):
+        return f"Set the target anew: {why}."
     if config.service.guide is not None and current_entry(record) is None:
         return "Set an entry point."
     return "Start the approach, or set another target."
@@ -68,8 +71,7 @@ def is_punctured(record: CaseRecord, procedure_id: int) -> bool:
 
 def is_calibrated(config: Config, record: CaseRecord) -> bool:
     """As the room is used: with the guide's four axes if it has them."""
-    name = CALIBRATION if config.service.guide is None else GUIDE_CALIBRATION
-    return record.last_procedure(name, "done") is not None
+    return latest_calibration(record, guide=config.service.guide is not None) is not None
 
 
 def plain_words(code: str) -> str:
@@ -79,3 +81,39 @@ def plain_words(code: str) -> str:
 def outcome_text(name: str, state: str, result: Any) -> str:
     reason = (result or {}).get("reason", "")
     return f"{name} {state}" + (f": {reason}" if reason else "")
+
+
+def next_action(
+    config: Config,
+    record: CaseRecord,
+    link: RoomLink,
+    execution: Execution,
+    found: Readiness | None,
+) -> str:
+    """What the prompt asks the operator to do, as the API calls it; empty: wait, or look."""
+    status = link.status
+    if status is None:
+        return ""
+    if execution.question is not None:
+        return "answer"
+    if record.running_procedure() is not None:
+        idle = not status.moving and (status.stopped or not status.armed)
+        return "reset" if idle else "acquisition" if execution.request is not None else ""
+    if found is not None and found.ready:
+        return "needle-out" if is_punctured(record, found.procedure_id) else "puncture"
+    if status.stopped or not status.armed:
+        return "reset"
+    if status.insertion_locked:
+        return "needle-out"
+    return _next_of_an_idle_room(config, record)
+
+
+def _next_of_an_idle_room(config: Config, record: CaseRecord) -> str:
+    if not is_calibrated(config, record):
+        return "calibration"
+    target = current_target(record)
+    if target is None or why_void_target(record, target):
+        return "target"
+    if config.service.guide is not None and current_entry(record) is None:
+        return "entry"
+    return "approach"

@@ -61,7 +61,8 @@ class LostState(_Frozen):
 class MeasurementState(_Frozen):
     """The newest finished measurement: positions in the slice and in the patient.
 
-    lost: why it does not say any more where the fiducial is; age_s: since it was asked for.
+    lost: why it does not say any more where the fiducial is; age_s: since it was asked for;
+    by_hand: it rests on a slice that a person assigned against the listener.
     """
 
     measurement_id: int
@@ -82,6 +83,7 @@ class MeasurementState(_Frozen):
     has_reconstruction: bool = False
     age_s: float | None = None
     lost: LostState | None = None
+    by_hand: bool = False
 
 
 class FiducialState(_Frozen):
@@ -134,6 +136,14 @@ class ArrivalState(_Frozen):
     tip_mm: tuple[float, float, float] | None = None
     joint_mm: tuple[float, float, float] | None = None
     age_s: float | None = None
+    by_hand: bool = False
+
+
+class DriveState(_Frozen):
+    """What a calibration drives: one axis from where it stands, stop by stop."""
+
+    axis: str
+    stops_mm: tuple[float, ...]
 
 
 class SliceState(_Frozen):
@@ -210,10 +220,13 @@ class RoomState(_Frozen):
     procedure: str | None = None
     procedure_id: int | None = None
     last_outcome: str = ""
+    last_failure: str | None = None
     prompt: str = ""
     ready: bool = False
     ready_lost: LostState | None = None
     ready_valid_s: float
+    next_action: str = ""
+    calibration_drives: list[DriveState] = []
     arrival: ArrivalState | None = None
     robot: RobotState = RobotState()
     acquisition_request: AcquisitionState | None = None
@@ -225,6 +238,7 @@ class RoomState(_Frozen):
     calibrated: bool = False
     guide: bool = False
     target_patient_mm: tuple[float, float, float] | None = None
+    target_lost: LostState | None = None
     error: ErrorState | None = None
     error_reason: str = ""
     tolerance_mm: float

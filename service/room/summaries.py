@@ -21,7 +21,10 @@ class KnownTarget(BaseModel):
 
 
 class MeasurementBody(BaseModel):
-    """`error_mm` is the distance, in the image plane, to the target that was set at that time."""
+    """`error_mm` is the distance, in the image plane, to the target that was set at that time.
+
+    by_hand: it rests on a slice that a person assigned against the listener.
+    """
 
     measurement_id: int
     state: str
@@ -37,6 +40,7 @@ class MeasurementBody(BaseModel):
     error_mm: float | None
     snr: float | None
     has_reconstruction: bool
+    by_hand: bool = False
 
 
 class CaseSummary(BaseModel):

@@ -99,7 +99,12 @@ class Broadcast:
         if time.monotonic() - self._told_s < _BEAT_S:
             return
         loop = self._loop
-        told = {"at_s": loop.state.at_s, "now_s": time.time(), "age_s": round(loop.state_age_s, 3)}
+        told = {
+            "at_s": loop.state.at_s,
+            "now_s": time.time(),
+            "clock_s": round(time.monotonic(), 3),
+            "age_s": round(loop.state_age_s, 3),
+        }
         body = json.dumps(told)
         self._tell(None, [], f"event: beat\ndata: {body}\n\n".encode())
 

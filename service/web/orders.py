@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import time
+from contextvars import ContextVar
 from typing import Annotated, Any
 
 from fastapi import Depends, Header, Request
@@ -25,10 +27,28 @@ REFUSALS = responses(400, 401, 403, 409, 413, 422, 429, 503)
 REFUSALS_WITH_ID = responses(400, 401, 403, 404, 409, 413, 422, 429, 503)
 
 
-def identity_of(request: Request) -> Identity:
-    """Who asks, as the gate found out."""
+ASKED_AT = "X-Asked-At"
+_asked_s: ContextVar[float | None] = ContextVar("asked_s", default=None)
+
+
+async def identity_of(request: Request) -> Identity:
+    """Who asks, as the gate found out; notes when it was asked."""
+    _asked_s.set(when_asked(request.headers.get(ASKED_AT), time.monotonic()))
     identity: Identity = request.state.identity
     return identity
+
+
+def when_asked(told: str | None, now_s: float) -> float:
+    """When an order was given, by our clock that nobody sets.
+
+    told: by whoever asks (the header X-Asked-At: `clock_s` of a beat, and the time since); it can
+    only make an order older than its arrival.
+    """
+    try:
+        asked_s = float(told or "")
+    except ValueError:
+        return now_s
+    return asked_s if asked_s <= now_s else now_s
 
 
 Caller = Annotated[Identity, Depends(identity_of)]
@@ -46,9 +66,10 @@ class Orders:
     ) -> Any:
         """Carry out a command of the control loop; `body` and `path` are its arguments."""
         arguments = {**body.model_dump(), **path, "by": who(caller, body.by)}
+        asked_s = _asked_s.get()
         what = f"{name} {body.model_dump_json()} {path}"
         return self._once.carry_out(
-            caller.name, key, what, lambda: self._loop.call(name, arguments)
+            caller.name, key, what, lambda: self._loop.call(name, arguments, asked_s)
         )
 
 

@@ -176,6 +176,10 @@ class SliceBody(BaseModel):
     time_source: str
     series_description: str
     geometry: dict[str, Any] | None
+    offered_hold_id: int | None = Field(
+        default=None,
+        description="The hold for which a person may say that this slice is of it.",
+    )
 
 
 class Health(BaseModel):

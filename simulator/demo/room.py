@@ -186,6 +186,7 @@ class DemoRoom:
                 "distortion_corrected": False,
                 # the tubes at the edge of the field are round, too
                 "start_region_px": [30, 30, 98, 98],
+                "readout_polarity": virtual.protocol.readout_polarity,
             },
             "listener": {
                 "port": dicom_port,

@@ -64,7 +64,10 @@ class LineRoom:
     """`call` orders, `do` what happens to the room, `until` the state is as wanted."""
 
     def __init__(self, folder: Path, more: str = "", seed: int = 1) -> None:
-        (folder / "room.toml").write_text(_FILE.format(more=more))
+        text = _FILE.format(more=more)
+        if "confirm_moves = true" in more:
+            text = text.replace("confirm_moves = false\n", "")
+        (folder / "room.toml").write_text(text)
         (folder / "bridge").mkdir()
         self.config = load_config(folder / "room.toml", {})
         self.line = VirtualRoom(folder / "bridge", seed)
@@ -215,7 +218,9 @@ class LineRoom:
         for asked in self.loop._record.requested_measurements():
             self._measure(asked)
 
-    def _add_slice(self, hold_id: int | None, header: dict[str, Any]) -> int:
+    def _add_slice(
+        self, hold_id: int | None, header: dict[str, Any], reason_code: str = "outside_hold"
+    ) -> int:
         self._slices += 1
         geometry = {
             "shape": [128, 128],
@@ -223,7 +228,7 @@ class LineRoom:
             "row_direction": [0.0, 0.0, -1.0],
             "col_direction": [1.0, 0.0, 0.0],
             "spacing_mm": [1.0, 1.0],
-        }
+        } | header.get("geometry", {})
         row = self.loop._record.add_slice(
             NewSlice(
                 sop_instance_uid=f"1.2.3.{self._slices}",
@@ -232,7 +237,7 @@ class LineRoom:
                 path="none",
                 state="quarantined" if hold_id is None else "assigned",
                 hold_id=hold_id,
-                reason_code="" if hold_id else "outside_hold",
+                reason_code="" if hold_id else reason_code,
                 reason="",
                 received_s=time.time(),
                 received_monotonic_s=time.monotonic(),

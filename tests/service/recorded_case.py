@@ -50,7 +50,7 @@ def add_measurement(record: CaseRecord) -> int:
             shift_px=(row_mm, col_mm),
             settled_at_s=time.time(),
         )
-        _add_slice(record, hold.hold_id, {"xt": col_mm, "yt": row_mm})
+        add_slice(record, hold.hold_id, {"xt": col_mm, "yt": row_mm})
         holds.append(HoldShift(hold.hold_id, (row_mm, col_mm)))
     return request_measurement(record, tuple(holds))
 
@@ -73,7 +73,8 @@ def request_measurement(record: CaseRecord, holds: tuple[HoldShift, ...]) -> int
     return number
 
 
-def _add_slice(record: CaseRecord, hold_id: int, stage_mm: dict[str, float]) -> None:
+def add_slice(record: CaseRecord, hold_id: int | None, stage_mm: dict[str, float]) -> int:
+    """A slice of a hold, or (None) one that the listener has set aside for its time."""
     inbox = record.case_dir / "inbox"
     inbox.mkdir(exist_ok=True)
     number = len(list(inbox.iterdir())) + 1
@@ -86,10 +87,10 @@ def _add_slice(record: CaseRecord, hold_id: int, stage_mm: dict[str, float]) -> 
         frame=0,
         sha256=hashlib.sha256(path.read_bytes()).hexdigest(),
         path=str(path.relative_to(record.case_dir)),
-        state="assigned",
+        state="quarantined" if hold_id is None else "assigned",
         hold_id=hold_id,
-        reason_code="",
-        reason="",
+        reason_code="outside_hold" if hold_id is None else "",
+        reason="outside of any hold" if hold_id is None else "",
         received_s=now_s,
         received_monotonic_s=time.monotonic(),
         acquired_from_s=now_s - 1,
@@ -97,7 +98,7 @@ def _add_slice(record: CaseRecord, hold_id: int, stage_mm: dict[str, float]) -> 
         time_source="AcquisitionDateTime",
         header=header_for_record(header),
     )
-    record.add_slice(row)
+    return record.add_slice(row).slice_id
 
 
 def come_to_ready(record: CaseRecord) -> int:

@@ -227,13 +227,13 @@ def test_a_slice_is_set_aside_and_taken_back_and_the_record_says_by_whom(
         "tester",
         "a doubtful one",
     )
-    client.assign_slice(slice_.slice_id, slice_.hold_id)
+    client.assign_slice(slice_.slice_id, slice_.hold_id, why="it was right")
     back = next(s for s in client.slices() if s.slice_id == slice_.slice_id)
     assert (back.state, back.hold_id) == ("assigned", slice_.hold_id)
     events = [e for e in client.events() if e.kind == "slice_reassigned"]
     assert [event.who for event in events] == ["tester", "tester"]
     with pytest.raises(RefusedByServiceError, match="no hold 99999"):
-        client.assign_slice(slice_.slice_id, 99999)
+        client.assign_slice(slice_.slice_id, 99999, why="a slip")
 
 
 def test_a_clock_is_reset_and_slices_are_given_up_and_the_record_says_by_whom_and_why(

@@ -26,8 +26,7 @@ from service.procedure.registry import (
     guide_approach_arguments,
     guide_calibration_arguments,
 )
-from service.procedure.sensing import ProcedureFailedError
-from service.procedure.steering import REJECT
+from service.procedure.sensing import REJECT, ProcedureFailedError
 from service.procedure.targets import needle_line
 from simulator.config import Fiducial, VirtualRoom
 from simulator.mr_slice import slice_geometry

@@ -60,6 +60,9 @@ def test_a_whole_case_from_calibration_to_the_needle_out_by_clicking(
 ) -> None:
     ready_to_calibrate(page, client)
     button(page, "Start the calibration")
+    # what will move, and how far, is said before it does
+    expect(page.locator("#actions")).to_contain_text("xt: ")
+    button(page, "Drive the stages – calibrate")
     wait_for(client.state, lambda s: s.procedure == "calibration")
     wait_for(client.state, lambda s: s.procedure is None and s.calibrated, 120.0)
     expect(page.locator("#prompt")).to_contain_text("target")
@@ -95,6 +98,7 @@ def test_a_whole_case_from_calibration_to_the_needle_out_by_clicking(
     page.locator("#depth").fill("61.5")
     button(page, "Record the puncture")
     button(page, "Needle withdrawn – unlock motion")
+    button(page, "Yes, the needle is out of the patient – unlock")
     expect(page.locator("#chips")).not_to_contain_text("Motion locked", timeout=SLOW_MS)
     events = {event.kind: event for event in client.events()}
     assert events["puncture"].body["insertion_depth_mm"] == 61.5

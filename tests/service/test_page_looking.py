@@ -201,6 +201,7 @@ def test_motion_is_locked_for_the_needle_by_hand_and_unlocked(
     expect(page.locator("#chips")).to_contain_text("Motion locked")
     expect(page.get_by_role("button", name="xt plus 1 mm")).to_be_disabled()
     page.get_by_role("button", name="Needle withdrawn – unlock motion").click()
+    page.get_by_role("button", name="Yes, the needle is out").click()
     expect(page.locator("#chips")).not_to_contain_text("Motion locked")
 
 
@@ -277,7 +278,7 @@ def test_slices_that_will_not_come_are_given_up_where_slices_were_set_aside(
     )
     assert given_up[-1].who == "operator"
     assert given_up[-1].body["hold_id"] == slice_.hold_id
-    client.assign_slice(slice_.slice_id, slice_.hold_id)
+    client.assign_slice(slice_.slice_id, slice_.hold_id, why="it was right")
 
 
 def test_report_and_export_of_this_case_and_of_others_are_a_click_away(

@@ -19,15 +19,18 @@ from service.procedure.registry import (
     guide_approach_arguments,
     guide_calibration_arguments,
 )
-from service.procedure.steering import CONFIRM
+from service.procedure.scan_frame import newest_frame
+from service.procedure.sensing import CONFIRM
 from service.procedure.targets import (
     Target,
     TargetError,
     current_entry,
     current_entry_number,
     current_target,
+    why_void_target,
 )
 from service.room.context import Room
+from service.room.history import arrival_by_hand
 from service.room.present import PUNCTURE, readiness
 from service.room.readiness import ConflictError
 
@@ -76,10 +79,12 @@ class ProcedureCommands:
                 target,
                 self._newest_header(),
                 self._room.seed(),
+                proven=self._room.is_proven(start),
             )
         except TargetError as error:
             raise _unusable(error) from error
         body = {**approach_arguments(arguments, start), "target": target.number}
+        body["scan_frame"] = self._scan_frame()
         return self._room.begin(APPROACH, body, by)
 
     def _start_guide_approach(self, guide: GuideConfig, by: str) -> int:
@@ -97,23 +102,30 @@ class ProcedureCommands:
                 entry_mm,
                 target,
                 self._newest_header(),
+                proven=self._room.is_proven(start),
             )
         except TargetError as error:
             raise _unusable(error) from error
         entry = current_entry_number(self._room.record)
         body = {**guide_approach_arguments(arguments, start), "target": target.number}
-        body["entry"] = entry
+        body["entry"], body["scan_frame"] = entry, self._scan_frame()
         return self._room.begin(GUIDE_APPROACH, body, by)
 
     def _target(self) -> Target:
         target = current_target(self._room.record)
         if target is None:
             raise ConflictError("no_target", "Set a target first.")
+        if why := why_void_target(self._room.record, target):
+            raise ConflictError("target_void", f"The target cannot be used: {why}.")
         return target
 
     def _newest_header(self) -> Mapping[str, Any]:
         newest = self._room.record.last_slice("assigned")
         return {} if newest is None else newest.header
+
+    def _scan_frame(self) -> dict[str, Any] | None:
+        frame = newest_frame(self._room.record)
+        return None if frame is None else frame.to_json()
 
     def answer(self, question_id: str, choice: str, by: str, plan_id: str | None = None) -> None:
         """Answer the question that is on the page; void if it is another one by now.
@@ -187,6 +199,7 @@ class ProcedureCommands:
             "insertion_depth_mm": insertion_depth_mm,
             "error_mm": found.arrival["error_mm"],
             "sigma_mm": found.arrival["sigma_mm"],
+            "by_hand": arrival_by_hand(self._room.record, found.procedure_id),
         }
         self._room.note(PUNCTURE, by, body)
 

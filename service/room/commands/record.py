@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 
-from dicom_listener.overrule import give_up_slices, reassign, reset_clock
+from dicom_listener.overrule import give_up_slices, reassign, reset_clock, why_not_by_hand
 from service.room.context import Room
 from service.room.readiness import ConflictError
 
@@ -16,13 +16,24 @@ class RecordCommands:
         self._room = room
 
     def assign_slice(self, slice_id: int, hold_id: int | None, why: str, by: str) -> None:
-        """Overrule the listener: the slice belongs to this hold, or (None) to none."""
-        row = self._room.record.slice(slice_id)
+        """Overrule the listener: the slice belongs to this hold, or (None) to none.
+
+        What needs no clock of the scanner is checked for people too, and a reason is asked for.
+        """
+        record = self._room.record
+        row = record.slice(slice_id)
         if hold_id is not None:
-            self._room.record.hold(hold_id)
-            if not row.header.get("geometry"):
-                raise ConflictError("no_geometry", f"Slice {slice_id} has no geometry: rescan.")
-        reassign(self._room.record, slice_id, hold_id, by, why or "decided on the page")
+            refused = why_not_by_hand(record, row, record.hold(hold_id), self._planes_mm())
+            if refused:
+                text = f"Slice {slice_id} is not of hold {hold_id}: {refused}. Rescan."
+                raise ConflictError("not_of_hold", text)
+            if not why.strip():
+                raise ConflictError("no_reason", "Say why this slice is of that hold after all.")
+        reassign(record, slice_id, hold_id, by, why.strip())
+
+    def _planes_mm(self) -> tuple[float, ...]:
+        guide = self._room.config.service.guide
+        return () if guide is None else (guide.upper_slice_mm, guide.lower_slice_mm)
 
     def give_up_slices(self, hold_id: int, why: str, by: str) -> None:
         """No more slices will come of a hold: the next one need not be scanned again for it."""

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Any
 
 from service.procedure.fiducial_plan import recording_of
 from service.procedure.guide_plan import guide_recording_of
 from service.procedure.registry import APPROACHES, GUIDE_RECORDING, RECORDING, recording_arguments
+from service.procedure.scan_frame import newest_frame
 from service.procedure.targets import (
     ENTRY_SET,
     TARGET_SET,
@@ -16,7 +18,10 @@ from service.procedure.targets import (
     current_target,
 )
 from service.room.context import Room
+from service.room.proposals import Plan, why_not_in_bore, why_senseless
+from service.room.reach import OutOfReachError, ReachUnknownError, check_reach
 from service.room.readiness import ConflictError
+from service.room.summaries import PointMm
 
 
 class TargetCommands:
@@ -31,9 +36,31 @@ class TargetCommands:
         """Set where the fiducial is to be, in patient mm (LPS); in_water: a place in tissue."""
         if len(patient_mm) != 3 or not all(math.isfinite(value) for value in patient_mm):
             raise ConflictError("bad_target", "A target is three finite numbers, patient mm.")
+        x, y, z = (float(value) for value in patient_mm)
+        self._judge((x, y, z), in_water)
         self._void_plan_for(by, "target was changed")
-        body = {"patient_mm": [float(value) for value in patient_mm]}
-        self._room.note(TARGET_SET, by, {**body, "label": label, "in_water": in_water})
+        frame = newest_frame(self._room.record)
+        body = {"patient_mm": [x, y, z], "label": label, "in_water": in_water}
+        seen = {} if frame is None else {"scan_frame": frame.to_json()}
+        self._room.note(TARGET_SET, by, {**body, **seen})
+
+    def _judge(self, patient_mm: PointMm, in_water: bool) -> None:
+        """Refuse a target that cannot be one, as far as that can be told now."""
+        plan = Plan("operator", "target", "page", patient_mm)
+        if why := why_senseless(plan) or why_not_in_bore(plan):
+            raise ConflictError("bad_target", f"Not set: {why}.")
+        if in_water and not self._room.config.imaging.readout_polarity:
+            raise ConflictError(
+                "no_polarity",
+                "Not set: for a target in tissue the readout's polarity must be known "
+                "(imaging.readout_polarity in the room's file).",
+            )
+        try:
+            check_reach(self._room, plan, in_water=in_water)
+        except OutOfReachError as error:
+            raise ConflictError("out_of_reach", f"Not set: {error}.") from error
+        except ReachUnknownError:
+            pass  # an approach asks again before anything moves
 
     def withdraw_target(self, by: str) -> None:
         """There is no target any more until another one is set."""
@@ -48,7 +75,9 @@ class TargetCommands:
         if known is None:
             raise ConflictError("no_target", f"This case has no target number {number}.")
         self._void_plan_for(by, "target was changed")
-        body = {"patient_mm": list(known.patient_mm), "label": known.label}
+        body: dict[str, Any] = {"patient_mm": list(known.patient_mm), "label": known.label}
+        if known.frame is not None:  # it is where it was set, not where it is chosen again
+            body |= {"scan_frame": known.frame.to_json(), "scan_frame_seq": known.frame_seq}
         self._room.note(TARGET_SET, by, {**body, "in_water": known.in_water, "again": number})
 
     def record_target(self, by: str, label: str = "") -> int:
@@ -60,10 +89,12 @@ class TargetCommands:
         guide = self._room.guide_wanted(None)
         if guide is not None:
             start = self._room.start_point(guide=True)
-            told = recording_arguments(guide_recording_of(self._room.config, guide), start)
+            proof = self._room.proof_arguments(start)
+            told = recording_arguments(guide_recording_of(self._room.config, guide, proof), start)
             return self._room.begin(GUIDE_RECORDING, {**told, "label": label, "by": by}, by)
-        arguments = recording_of(self._room.settings(), self._room.seed())
         start = self._room.start_point()
+        proof = self._room.proof_arguments(start)
+        arguments = recording_of(self._room.settings(), self._room.seed(), proof)
         body = {**recording_arguments(arguments, start), "label": label, "by": by}
         return self._room.begin(RECORDING, body, by)
 

@@ -6,7 +6,9 @@ from typing import Annotated
 
 from fastapi import APIRouter, Query, Request, Response
 
+from case_record.record import CaseRecord
 from case_record.rows import SliceRow
+from dicom_listener.overrule import offered_hold
 from service.room.history import known_targets, past_cases, targets_over_time
 from service.room.summaries import CaseSummary, KnownTarget, MeasurementBody
 from service.web.of_case import OfCase, RoomCases
@@ -72,14 +74,16 @@ def slice_router() -> APIRouter:
         """Every slice that was received, with what was decided about it and by whom."""
         with case.record() as record:
             rows = record.page_of_slices(after_id=after, limit=limit, newest=newest, state=state)
+            bodies = [_slice_body(row, _offered(record, row)) for row in rows]
         link_onward(request, response, [row.slice_id for row in rows], limit)
-        return [_slice_body(row) for row in rows]
+        return bodies
 
     @router.get("/slices/{slice_id}", responses=ERRORS_WITH_ID)
     def one_slice(slice_id: Id, case: OfCase) -> SliceBody:
         """One slice."""
         with case.record() as record:
-            return _slice_body(record.slice(slice_id))
+            row = record.slice(slice_id)
+            return _slice_body(row, _offered(record, row))
 
     return router
 
@@ -113,9 +117,15 @@ def measurement_router() -> APIRouter:
     return router
 
 
-def _slice_body(row: SliceRow) -> SliceBody:
-    names = set(SliceBody.model_fields) - {"series_description", "geometry"}
+def _offered(record: CaseRecord, row: SliceRow) -> int | None:
+    hold = offered_hold(record, row)
+    return None if hold is None else hold.hold_id
+
+
+def _slice_body(row: SliceRow, offered_hold_id: int | None) -> SliceBody:
+    names = set(SliceBody.model_fields) - {"series_description", "geometry", "offered_hold_id"}
     return SliceBody(
+        offered_hold_id=offered_hold_id,
         series_description=str(row.header.get("series_description") or ""),
         geometry=row.header.get("geometry") or None,
         **{name: getattr(row, name) for name in names},
