@@ -6,7 +6,7 @@ ARGS   ?=
 WORKERS ?= 2
 PIP    := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
-.PHONY: setup demo test quick lint bench soak docs lock clean
+.PHONY: setup demo test quick lint bench soak docs lock clean bridge-wheel
 
 setup: $(VENV)/.runtime
 
@@ -26,7 +26,7 @@ demo: $(VENV)/.runtime
 
 test: $(VENV)/.dev
 	sh tests/system_packages.sh
-	$(BIN)/python -m pytest $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
 
 # The pure tests: no processes, no browser.
 quick: $(VENV)/.dev
@@ -40,6 +40,10 @@ lint: $(VENV)/.dev
 
 bench: $(VENV)/.dev
 	for script in benchmarks/[a-z]*.py; do $(BIN)/python $$script --quick || exit 1; done
+
+# The bridge alone, for the small computer in the scanner room.
+bridge-wheel: $(VENV)/.dev
+	cd wheels/robot_bridge && $(abspath $(BIN))/python -m hatchling build -t wheel -d $(CURDIR)/dist
 
 # The long campaigns; the tests run a short form of each.
 soak: $(VENV)/.dev

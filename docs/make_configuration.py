@@ -34,9 +34,9 @@ the table by itself. Travel limits have no default on purpose.
 
 | key | default | meaning |
 | --- | --- | --- |
-| `link` | required | Serial device or pyserial URL of the line to the service. |
+| `link` | none | Serial device or pyserial URL of the line to the service; not needed on a bench. |
 | `link_baud` | 115200 | Speed of that line. |
-| `state_dir` | required | Folder of the journal; must survive a restart. |
+| `state_dir` | required | Folder of the journal, relative to the file; must survive a restart. |
 | `status_file` | `state_dir`/bridge_status.json | Health, rewritten as the bridge runs. |
 | `heartbeat_s`, `deadman_s` | 0.2, 1.0 | Silence of the service longer than the deadman stops all motion. |
 | `motion_timeout_s` | 60 | A motion that lasts longer is stopped. |
@@ -48,16 +48,23 @@ the table by itself. Travel limits have no default on purpose.
 | `capture_file` | none | Every byte to and from the controllers. |
 | `service_link` | none | The service's end of the line, for `autospine robot`; else `[service] bridge_link`. |
 | axis `name` | required | `xt`, `yt` (top stage), `xb`, `yb` (bottom stage). |
-| axis `controller`, `address` | required | Serial device and PMD401/PMD301 address. |
+| axis `controller`, `address` | required | Serial device (`/dev/serial/by-id/...`) and address. |
+| axis `serial_number` | none | Of the board (Y42); else the one that answered first is remembered. |
 | axis `drive` | required | `open_loop` (steps) or `closed_loop` (encoder). |
 | axis `travel_min_mm`, `travel_max_mm` | required | Both ends allowed. |
 | axis `sign` | required | 1 or -1: whether the axis grows when the controller runs forward. |
 | axis `speed_hz` | 400 | wfm-steps a second, capped by the controller's own limit. |
 | axis `step_um_forward`, `step_um_reverse` | required open loop | From `autospine robot calibrate-steps`. |
+| axis `step_error` | 0.05 | How wrong these may be; the bound of a counted position grows by it. |
 | axis `approach_um` | 0 | Overshoot so that every position is reached from the same side. |
-| axis `tolerance_um` | 20 | Open loop: how near counts as reached. |
+| axis `tolerance_um` | 20 | How near counts as there; an axis that near is not moved. |
 | axis `counts_per_mm`, `tolerance_counts`, `encoder_type` | closed loop | The encoder; type is Y13. |
+| axis `encoder_direction` | flash | Y6, from `autospine robot find-encoder`. |
 | axis `home_mm` | none | Where the reference lies. |
+| axis `home_to` | `end` | `end` (limit switch or mechanical end) or `index` of the encoder. |
+| axis `limit_switches` | flash | Y2: 0 none, 1 active high, 2 active low. |
+| axis `ramp_up_hz_per_ms`, `overshoot_model`, `waveform` | 20, 3, `delta` | Y9, Y12, `delta` or `rhomb`. |
+| axis `estop_input` | none | Input 0 or 3 of the board: low means that the emergency stop is pressed. |
 """
 
 GUIDE_TEXT = (

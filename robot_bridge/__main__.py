@@ -18,7 +18,8 @@ from robot_bridge.pmd.protocol import emergency_stop_bytes
 EXIT_DONE, EXIT_BAD_INPUT, EXIT_COULD_NOT = 0, 2, 3
 
 
-def make_motors(config: BridgeConfig) -> PmdMotors:
+def make_motors(config: BridgeConfig, *, exclusive: bool = True) -> PmdMotors:
+    """exclusive: hold the ports alone; only a stop asks for less."""
     return PmdMotors(
         config.axes,
         baud=config.controller_baud,
@@ -26,6 +27,7 @@ def make_motors(config: BridgeConfig) -> PmdMotors:
         response_delay_us=config.controller_response_delay_us,
         park_after_move=config.park_after_move,
         capture_file=config.capture_file,
+        exclusive=exclusive,
     )
 
 

@@ -6,6 +6,7 @@ orthogonal to all that a frame has of its own. What is left over, frame by frame
 the frames agree with their shifts.
 """
 
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -120,12 +121,49 @@ def localize(
             pixels, like, psf, radius_bounds_px=bounds, shape=shape, wall_px=wall_px,
             noise=noise, sigma=sigma, robust=robust,
         )  # fmt: skip
+        if fit.n_masked > np.count_nonzero(~pixels.mask):
+            whole = _without_mask(pixels, fit, psf, bounds, shape, wall_px, noise, sigma)
+            fit = fit if whole is None else _widened_by_mask(fit, whole)
         _refuse_doubtful(fit, begin, frame.shape)
         fits.append(fit)
         guess = (*(fit.centre_px - shift), fit.radius_px)
     result = _combine(fits, shifts, psf, shift_sigma_px)
     _refuse_outside_gate(result.centre_px, start, gate_px)
     return result
+
+
+def _without_mask(
+    pixels: Pixels,
+    like: DiscFit,
+    psf: Psf,
+    bounds: tuple[float, float],
+    shape: Shape,
+    wall_px: float | None,
+    noise: NoiseKind,
+    sigma: float | None,
+) -> DiscFit | None:
+    """The fit to all pixels; None where it does not settle."""
+    try:
+        return fit_disc(
+            pixels, like, psf, radius_bounds_px=bounds, shape=shape, wall_px=wall_px,
+            noise=noise, sigma=sigma, robust=False,
+        )  # fmt: skip
+    except (NoRoundObjectError, NotConvergedError):
+        return None
+
+
+def _widened_by_mask(fit: DiscFit, whole: DiscFit) -> DiscFit:
+    """What the pixels left out would have done to the centre belongs to its uncertainty.
+
+    A bubble is left out rightly, one end of an oval outline is not, and one frame does not always
+    tell which it was.
+    """
+    apart = fit.centre_px - whole.centre_px
+    if not np.any(np.abs(apart) > np.sqrt(np.diag(fit.covariance_px2))):
+        return fit
+    covariance = fit.covariance.copy()
+    covariance[:2, :2] += np.outer(apart, apart)
+    return replace(fit, covariance=covariance)
 
 
 def _recognised(

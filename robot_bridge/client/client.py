@@ -165,6 +165,10 @@ class BridgeClient:
         )
         self._session.known_motion = self.status.last_motion
 
+    def set_drives(self, on: bool, by: str) -> None:
+        """Power of all motors; `status.parked` follows. A move puts it on by itself."""
+        self._ask(messages.SetDrives(on=on, by=by, seen_ms=self._session.seen_ms()))
+
     def correct_position(
         self,
         correction_um: Mapping[str, int],

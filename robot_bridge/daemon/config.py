@@ -38,6 +38,7 @@ class AxisConfig:
     home_to: the mechanical end or limit switch nearest to `home_um`, or the encoder's index.
     limit_switches (Y2: 0 none, 1 active high, 2 active low), encoder_direction (Y6): None leaves
         what the board's flash holds. ramp_up_hz_per_ms is Y9, overshoot_model Y12.
+    estop_input: 0 or 3, the board's digital input that an emergency stop pulls low; None: none.
     """
 
     name: str
@@ -63,6 +64,7 @@ class AxisConfig:
     encoder_direction: int | None = None
     ramp_up_hz_per_ms: int = 20
     overshoot_model: int = 3
+    estop_input: int | None = None
     waveform: Literal["rhomb", "delta"] = "delta"
 
     @property
@@ -80,7 +82,7 @@ class AxisConfig:
 
 @dataclass(frozen=True)
 class BridgeConfig:
-    """link: the bridge's end of the line to the service.
+    """link: the bridge's end of the line to the service; "" on a bench without one.
 
     service_link: the service's end, for the engineer's commands; the service's own `bridge_link`
     in the same file stands in for it.
@@ -213,8 +215,11 @@ def _axis_from_table(raw: Any, where: str) -> AxisConfig:
         encoder_direction=table.integer("encoder_direction", 0, 1, default=None),
         ramp_up_hz_per_ms=table.integer("ramp_up_hz_per_ms", 1, 800, default=20),
         overshoot_model=table.integer("overshoot_model", 0, 3, default=3),
+        estop_input=table.integer("estop_input", 0, 3, default=None),
         waveform=table.text("waveform", default="delta", among=("rhomb", "delta")),
     )
+    if axis.estop_input in (1, 2):
+        raise table.fail("estop_input", "inputs 1 and 2 are the limit switches: 0 or 3")
     if axis.home_to == "index" and not closed:
         raise table.fail("home_to", "an axis without encoder has no index")
     table.finish()
@@ -229,13 +234,18 @@ def _heartbeat_and_deadman_s(keys: _Table) -> tuple[float, float]:
     return heartbeat_s, deadman_s
 
 
-def bridge_config_from_table(table: Mapping[str, Any], where: str) -> BridgeConfig:
-    """The checked `[bridge]` table; `where` names the file in errors. Raises ConfigError."""
+def bridge_config_from_table(
+    table: Mapping[str, Any], where: str, folder: Path = Path()
+) -> BridgeConfig:
+    """The checked `[bridge]` table; `where` names the file in errors. Raises ConfigError.
+
+    folder: of the file; its folders and files are relative to it.
+    """
     if not isinstance(table, Mapping):
         raise ConfigError(f"{where}: bridge: is not a table")
     keys = _Table(table, f"{where}: bridge.")
-    link = keys.text("link")
-    state_dir = Path(keys.text("state_dir"))
+    link = keys.text("link", default="")
+    state_dir = folder / keys.text("state_dir")
     heartbeat_s, deadman_s = _heartbeat_and_deadman_s(keys)
     status_file = keys.text("status_file", default=None)
     capture_file = keys.text("capture_file", default=None)
@@ -247,7 +257,7 @@ def bridge_config_from_table(table: Mapping[str, Any], where: str) -> BridgeConf
         link_baud=keys.integer("link_baud", 9600, 4_000_000, default=115200),
         service_link=keys.text("service_link", default=None),
         state_dir=state_dir,
-        status_file=Path(status_file) if status_file else state_dir / "bridge_status.json",
+        status_file=folder / status_file if status_file else state_dir / "bridge_status.json",
         heartbeat_s=heartbeat_s,
         deadman_s=deadman_s,
         motion_timeout_s=float(keys.number("motion_timeout_s", 0.5, 600.0, default=60.0)),
@@ -257,7 +267,7 @@ def bridge_config_from_table(table: Mapping[str, Any], where: str) -> BridgeConf
         controller_response_delay_us=keys.integer("controller_response_delay_us", 0, 255, 20),
         park_after_move=keys.boolean("park_after_move", default=False),
         guardian=keys.boolean("guardian", default=True),
-        capture_file=Path(capture_file) if capture_file else None,
+        capture_file=folder / capture_file if capture_file else None,
         axes=tuple(
             _axis_from_table(raw, f"{where}: bridge.axis[{number}]")
             for number, raw in enumerate(raw_axes)
@@ -304,7 +314,7 @@ def load_bridge_config(path: Path) -> BridgeConfig:
         raise ConfigError(f"{path}: is not TOML: {error}") from error
     if "bridge" not in table:
         raise ConfigError(f"{path}: bridge: the table [bridge] is missing")
-    config = bridge_config_from_table(table["bridge"], str(path))
+    config = bridge_config_from_table(table["bridge"], str(path), path.resolve().parent)
     service = table.get("service")
     link = service.get("bridge_link") if isinstance(service, Mapping) else None
     if config.service_link is None and isinstance(link, str):

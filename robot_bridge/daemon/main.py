@@ -226,11 +226,11 @@ def settings_of(config: BridgeConfig) -> BridgeSettings:
         motion_timeout_s=config.motion_timeout_s,
         motion_poll_s=config.motion_poll_s,
         software=SOFTWARE,
-        growth={axis.name: _growth_of(axis) for axis in config.axes},
+        growth={axis.name: growth_of(axis) for axis in config.axes},
     )
 
 
-def _growth_of(axis: AxisConfig) -> Growth:
+def growth_of(axis: AxisConfig) -> Growth:
     counted = axis.drive == "open_loop"
     return Growth(
         step_error=axis.step_error if counted else 0.0,
@@ -283,6 +283,8 @@ def run_bridge(
     exit_with_parent: bool = False,
 ) -> str:
     """The whole life of `python -m robot_bridge`; returns why it ended. Raises StartError."""
+    if not config.link:
+        raise StartError("bridge.link is missing: the line to the service (a bench needs --direct)")
     guardian = make_guardian(config) if config.guardian else None
     try:
         daemon = _start(config, make_motors, guardian, exit_with_parent)

@@ -95,6 +95,14 @@ class MotionInFlight:
         """An axis moved, or moves, without a command."""
         self._moved_otherwise(f"stray:{self._boot_id}")
 
+    def set_drives(self, *, on: bool) -> None:
+        """Raises MotorError."""
+        self.note_parking()
+        if on:
+            self._motors.motors.unpark()
+        else:
+            self._motors.motors.park()
+
     def declare_position(
         self, positions_um: Mapping[str, int], within_um: Mapping[str, int]
     ) -> None:

@@ -90,6 +90,9 @@ class Motors(Protocol):
     def park(self) -> None:
         """Take the power off; the motors hold by friction. Progress by `poll`: `parked`."""
 
+    def unpark(self) -> None:
+        """Put the power on (a move does that by itself). Progress by `poll`: `parked`."""
+
     def declare_position(self, positions_um: Mapping[str, int]) -> None:
         """The named axes, and no others, stand at these positions. Raises MotorError."""
 

@@ -30,6 +30,7 @@ from robot_bridge.protocol.messages import (
     Message,
     Move,
     Rearm,
+    SetDrives,
     SetInsertionLock,
     SetPhase,
 )
@@ -99,6 +100,10 @@ class Requests:
         self.motion.declare_position(request.positions_um, request.within_um)
         self.journal.note("declare", positions_um=request.positions_um, by=request.by)
 
+    def _set_drives(self, request: SetDrives) -> None:
+        self.motion.set_drives(on=request.on)
+        self.journal.note("drives", on=request.on, by=request.by)
+
     def _correct(self, request: CorrectPosition) -> None:
         self.motion.correct_position(request.correction_um, request.within_um)
 
@@ -142,6 +147,7 @@ _DO: dict[type[Message], Callable] = {
     SetInsertionLock: Requests._set_lock,
     DeclarePosition: Requests._declare,
     CorrectPosition: Requests._correct,
+    SetDrives: Requests._set_drives,
 }
 
 

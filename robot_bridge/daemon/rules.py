@@ -22,6 +22,7 @@ from robot_bridge.protocol.messages import (
     Message,
     Move,
     Rearm,
+    SetDrives,
     SetInsertionLock,
     SetPhase,
 )
@@ -193,6 +194,14 @@ def _bad_correction(standing: Standing, request: Message) -> Refusal | None:
     return _bad_bounds(request.within_um, standing)
 
 
+def _drives_held_off(standing: Standing, request: Message) -> Refusal | None:
+    # Power on may shift an axis a little; off is the safe direction.
+    assert isinstance(request, SetDrives)
+    if not request.on:
+        return None
+    return _stop_latched(standing, request) or _locked(standing, request)
+
+
 def _no_such_axis(standing: Standing, request: Message) -> Refusal | None:
     assert isinstance(request, Home)
     known = {axis.name for axis in standing.axes}
@@ -278,5 +287,6 @@ _RULES: dict[type[Message], tuple[Rule, ...]] = {
     ),
     Home: (*_MAY_MOVE, _nobody, _phase_forbids_home, _no_such_axis),
     DeclarePosition: (_nobody, _stale, _in_flight, _declared_beyond_travel),
+    SetDrives: (_nobody, _stale, _in_flight, _drives_held_off),
     CorrectPosition: (_stale, _in_flight, _bad_correction),
 }

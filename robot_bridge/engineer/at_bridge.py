@@ -18,7 +18,7 @@ from robot_bridge.client.client import (
 )
 from robot_bridge.daemon.config import BridgeConfig
 from robot_bridge.engineer import sessions
-from robot_bridge.engineer.at_motors import stop_motors
+from robot_bridge.engineer.at_motors import drives_directly, stop_motors, what_boards_say
 from robot_bridge.engineer.terminal import CouldNotError, UsageError, axis_named, confirm, show
 from robot_bridge.protocol.framing import encode_stop
 from robot_bridge.protocol.phases import WorkPhase
@@ -67,8 +67,9 @@ def show_status(args: argparse.Namespace, config: BridgeConfig) -> None:
         if health is not None:
             show(args, health)
             return
+    of_boards = what_boards_say(config) if args.direct else {}
     with connected(args, config) as client:
-        show(args, _status_fields(client.status))
+        show(args, _status_fields(client.status) | of_boards)
 
 
 def _fresh_health(path: Path) -> dict[str, object] | None:
@@ -178,8 +179,7 @@ def _report(args: argparse.Namespace, outcome: MoveOutcome) -> None:
 
 def stop(args: argparse.Namespace, config: BridgeConfig) -> None:
     if args.direct:
-        stop_motors(config)
-        show(args, {"stopped": True})
+        show(args, stop_motors(args, config))
         return
     client = _client_on_the_line(args, config)
     _shout_stop(args.link or str(config.service_link), config.link_baud, args.emergency)
@@ -227,6 +227,21 @@ def rearm(args: argparse.Namespace, config: BridgeConfig) -> None:
             confirm(args, f"clear stop {client.status.stop_count} ({reason})")
         client.rearm(args.by)
         client.disarm(args.by)
+        show(args, _status_fields(client.status))
+
+
+def drives(args: argparse.Namespace, config: BridgeConfig) -> None:
+    """Power of the motors off (for imaging) or on."""
+    if args.direct:
+        drives_directly(args, config)
+        return
+    with connected(args, config) as client:
+        client.set_drives(args.power == "on", args.by)
+        until_s = time.monotonic() + STOP_WAIT_S
+        while client.status.parked is (args.power == "on"):
+            if time.monotonic() > until_s:
+                raise CouldNotError(f"the drives are not {args.power} after {STOP_WAIT_S:g} s")
+            client.pump(0.02)
         show(args, _status_fields(client.status))
 
 

@@ -1,10 +1,12 @@
 """The engineer's commands straight at the controllers: no bridge may be running."""
 
 import argparse
+import contextlib
 import time
 
 from robot_bridge.__main__ import make_motors
 from robot_bridge.daemon.config import AxisConfig, BridgeConfig
+from robot_bridge.daemon.journal import Journal, JournalError, LatchedStop
 from robot_bridge.engineer import sessions
 from robot_bridge.engineer.calibrate_steps import calibrate_steps
 from robot_bridge.engineer.terminal import (
@@ -15,18 +17,120 @@ from robot_bridge.engineer.terminal import (
     confirm,
     show,
 )
+from robot_bridge.pmd.encoder_script import SCRIPT_STEPS
+from robot_bridge.protocol.messages import Code
 
 STEPS_MAX = 5000
+POWER_WAIT_S = 5.0
 LONGEST_STEP_UM = 8.0  # the manual's 5 +- 3 um
 
 
-def stop_motors(config: BridgeConfig) -> None:
-    """The bytes that stop every motor, whoever else holds the ports."""
-    motors = make_motors(config)
+def stop_motors(args: argparse.Namespace, config: BridgeConfig) -> dict[str, object]:
+    """Stop every motor, whoever else holds the ports; EMERGENCY parks and latches as well."""
+    motors = make_motors(config, exclusive=False)
     try:
-        motors.stop()
+        if not args.emergency:
+            motors.stop()
+            return {"stopped": True}
+        motors.park_now()
     finally:
         motors.close()
+    return {"stopped": True, "parked": True, "latched": _latch_emergency(config, args.by)}
+
+
+def _latch_emergency(config: BridgeConfig, by: str) -> bool:
+    """Raises CouldNotError, with the motors parked, if a bridge has the journal."""
+    try:
+        journal = Journal(config.state_dir)
+    except JournalError as error:
+        raise CouldNotError(
+            f"stopped and parked, but NOT latched ({error}): a running bridge takes its own "
+            "`stop --emergency`, without --direct"
+        ) from error
+    try:
+        number = journal.stop.number + 1
+        stop = LatchedStop(number, Code.EMERGENCY_STOP.value, True, True)
+        journal.latch_stop(stop, f"by {by}, straight at the controllers", time.time())
+    finally:
+        journal.close()
+    return True
+
+
+def find_encoder(args: argparse.Namespace, config: BridgeConfig) -> None:
+    """The controller's script: direction and gain of an encoder, as lines for the room's file."""
+    _require_direct(args, "runs the controller's own script")
+    axis = axis_named(config, args.axis)
+    confirm(args, f"run {axis.name} by 16 steps (some 0.07 mm) to and fro")
+    with sessions.bench(config) as (motors, journal):
+        _refuse_if_held(journal)
+        _check_room_for(axis, motors.measure_um(axis.name), SCRIPT_STEPS)
+        found = motors.find_encoder(axis.name)
+    step_um = (axis.step_um_forward + axis.step_um_reverse) / 2
+    show(
+        args,
+        {
+            "axis": axis.name,
+            "encoder_direction": found.direction,
+            "counts_per_step": round(found.counts_per_step, 3),
+            "step_um_if_counts_are_right": round(
+                found.counts_per_step * 1000 / axis.counts_per_mm, 3
+            ),
+            "counts_per_mm_if_steps_are_right": round(found.counts_per_step * 1000 / step_um, 1),
+        },
+    )
+
+
+def what_boards_say(config: BridgeConfig) -> dict[str, object]:
+    """Who they are, their supply and temperature, and what they do not answer."""
+    with sessions.bench(config) as (motors, _journal):
+        until_s = time.monotonic() + POWER_WAIT_S
+        while len((status := motors.poll()).supply) < len(config.axes):
+            if time.monotonic() > until_s or status.fault:
+                break
+            time.sleep(0.02)
+    return {
+        "boards": dict(status.boards),
+        "supply": {axis: dict(supply) for axis, supply in status.supply.items()},
+        "warnings": list(status.warnings),
+    }
+
+
+def drives_directly(args: argparse.Namespace, config: BridgeConfig) -> None:
+    """Power of the motors off or on, with no bridge running."""
+    with sessions.bench(config) as (motors, journal):
+        if args.power == "on":
+            _refuse_if_held(journal)
+            motors.unpark()
+        else:
+            motors.park()
+        until_s = time.monotonic() + POWER_WAIT_S
+        while (status := motors.poll()).parked is (args.power == "on"):
+            if time.monotonic() > until_s:
+                raise CouldNotError(f"the drives are not {args.power} after {POWER_WAIT_S:g} s")
+            time.sleep(0.02)
+    show(args, {"parked": status.parked})
+
+
+def accept_boards(args: argparse.Namespace, config: BridgeConfig) -> None:
+    """Boards were exchanged on purpose: these ones drive the axes from now on."""
+    _require_direct(args, "asks the boards who they are")
+    confirm(args, "take the boards that answer now for the axes' own, and forget the old ones")
+    with contextlib.closing(Journal(config.state_dir)) as journal:
+        motors = make_motors(config)
+        try:
+            boards = dict(motors.open().boards)
+        finally:
+            motors.close()
+        journal.tie_boards(boards, time.time())
+        journal.keep_stands({}, time.time())  # another board, another count
+    show(args, {"boards": boards})
+
+
+def _refuse_if_held(journal: Journal) -> None:
+    if journal.insertion_locked:
+        raise CouldNotError("refused, insertion_locked: the needle may be in")
+    if journal.stop.latched:
+        raise CouldNotError(f"refused, stop_latched: stop {journal.stop.number}; re-arm first")
 
 
 def measure_steps(args: argparse.Namespace, config: BridgeConfig) -> None:
@@ -37,10 +141,7 @@ def measure_steps(args: argparse.Namespace, config: BridgeConfig) -> None:
         raise UsageError(f"--steps is 1 to {STEPS_MAX}, --runs 2 to 50")
     confirm(args, f"run {axis.name} {args.runs} times {args.steps} steps forward and back")
     with sessions.bench(config) as (motors, journal):
-        if journal.insertion_locked:
-            raise CouldNotError("refused, insertion_locked: the needle may be in")
-        if journal.stop.latched:
-            raise CouldNotError(f"refused, stop_latched: stop {journal.stop.number}; re-arm first")
+        _refuse_if_held(journal)
         read_um = None if axis.drive == "closed_loop" else ask_for_um
         if read_um is None:
             _check_room_for(axis, motors.measure_um(axis.name), args.steps)

@@ -23,13 +23,15 @@ from robot_bridge.daemon.motors import MotorError
 from robot_bridge.engineer.at_bridge import (
     JOG_MAX_MM,
     declare,
+    drives,
     home,
     jog,
     rearm,
     show_status,
     stop,
 )
-from robot_bridge.engineer.at_motors import capture, measure_steps
+from robot_bridge.engineer.at_motors import accept_boards, capture, find_encoder, measure_steps
+from robot_bridge.engineer.at_ports import give_address, scan_port
 from robot_bridge.engineer.calibrate_steps import CalibrationError
 from robot_bridge.engineer.terminal import CouldNotError, UsageError
 from robot_bridge.protocol.transport import TransportError
@@ -41,7 +43,7 @@ COULD_NOT = (CalibrationError, JournalError, MotorError, OSError, TransportError
 
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="autospine robot", description=__doc__.splitlines()[0])
-    parser.add_argument("--config", type=Path, required=True, help="the room's TOML file")
+    parser.add_argument("--config", type=Path, help="the room's TOML file (not for a bare port)")
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--link", help="the service's end of the line to a running bridge")
     where.add_argument("--direct", action="store_true", help="straight at the controllers")
@@ -80,6 +82,25 @@ def _add_commands(commands: _Commands) -> None:
     add.add_argument("--steps", type=int, default=200)
     add.add_argument("--runs", type=int, default=3)
     add.set_defaults(do=measure_steps)
+    add = commands.add_parser("find-encoder", help="the controller finds direction and gain")
+    add.add_argument("axis")
+    add.set_defaults(do=find_encoder)
+    add = commands.add_parser("drives", help="power of the motors, off for imaging")
+    add.add_argument("power", choices=("on", "off"))
+    add.set_defaults(do=drives)
+    commands.add_parser(
+        "accept-boards", help="boards were exchanged on purpose: these are the axes' own now"
+    ).set_defaults(do=accept_boards)
+    add = commands.add_parser("scan", help="which boards answer on a port (needs no file)")
+    add.add_argument("port")
+    add.add_argument("--baud", type=int, default=115200)
+    add.set_defaults(at_port=scan_port)
+    add = commands.add_parser("set-address", help="give a board its address (needs no file)")
+    add.add_argument("port")
+    add.add_argument("old", type=int)
+    add.add_argument("new", type=int)
+    add.add_argument("--baud", type=int, default=115200)
+    add.set_defaults(at_port=give_address)
     add = commands.add_parser("capture", help="write the controllers' bytes to a file")
     add.add_argument("file", type=Path)
     add.add_argument("--seconds", type=float, default=10.0)
@@ -97,8 +118,12 @@ def main(argv: Sequence[str] | None = None) -> int:
     args = _parser().parse_args(argv)
     logging.getLogger("robot_bridge").setLevel(logging.ERROR)
     try:
-        config = load_bridge_config(args.config)
-        args.do(args, config)
+        if "at_port" in args:
+            args.at_port(args)
+            return EXIT_DONE
+        if args.config is None:
+            raise UsageError("--config is missing: the room's TOML file")
+        args.do(args, load_bridge_config(args.config))
     except (ConfigError, UsageError) as error:
         return _fail(error, EXIT_BAD_INPUT)
     except RefusedError as error:

@@ -75,6 +75,7 @@ def bench(
         try:
             motors = make_motors(replace(config, capture_file=capture_file or config.capture_file))
             try:
+                motors.know_boards(journal.boards)
                 motors.open()
                 yield motors, journal
             finally:

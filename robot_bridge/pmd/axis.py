@@ -34,10 +34,14 @@ from robot_bridge.pmd.status import ERRORS, Status
 
 # The controller's state settles some milliseconds after a command (25 ms in public drivers).
 SETTLE_S = 0.025
-STALL_WINDOW_S = 0.5
+# An encoder that shows no progress: far from the setpoint, where the motor runs fast, it is missed
+# at once; near it the controller may well take its time.
+STALL_WINDOW_S, FAR_WINDOW_S = 0.5, 0.15
+FAR_TOLERANCES, LOOKS_MIN = 10, 4
+STALE_S = 0.12
 RUNAWAY_MARGIN_UM = 100.0
-# Before its first long way an encoder has to follow a short run in open loop.
-PROOF_UM, PROOF_FROM_UM = 200.0, 400.0
+# Before its first way an encoder has to follow a short run in open loop.
+PROOF_UM = 200.0
 # Of the way that the steps should make: load and frequency change a step by a quarter, and a wrong
 # scale is most often one of two.
 FOLLOWS = 0.6
@@ -128,27 +132,36 @@ class PmdAxis(PmdController):
             raise self.error("refused", str(error)) from error
 
     def _prove(self, setpoint_um: int) -> Steps[None]:
-        """The encoder has to follow the motor once, before it is believed over a long way."""
-        distance_um = setpoint_um - self.position_um
-        if self.proven or not self.closed_loop or abs(distance_um) < PROOF_FROM_UM:
+        """The encoder has to follow the motor once over a short way, before it is believed."""
+        if self.proven or not self.closed_loop:
             return
         if (yield from self._microstep_phase()) is None:
             return  # nothing would tell how far the motor went, so the encoder cannot be blamed
         from_um = self.position_um
-        run_um = PROOF_UM if distance_um > 0 else -PROOF_UM
-        yield from self.run_open_loop(pmd_units.microsteps_from_um(self.config, run_um))
-        yield from self.read_position_surely()
-        self.at_rest_um = self.position_um
-        moved_um = self.position_um - from_um
-        if abs(run_um) > 4 * self.jitter_um and not agrees(moved_um, run_um):
-            self.certain = False
-            raise self.error("encoder_disagrees", disagreement(moved_um, run_um))
-        self.proven = True
+        towards = 1 if setpoint_um > from_um else -1
+        end_um = self.config.travel_max_um if towards > 0 else self.config.travel_min_um
+        if abs(end_um - from_um) < 2 * PROOF_UM:
+            towards = -towards
+        run_um = towards * PROOF_UM
+        try:
+            yield from self.run_open_loop(pmd_units.microsteps_from_um(self.config, run_um))
+            yield from self.read_position_surely()
+            self.at_rest_um = self.position_um
+            moved_um = self.position_um - from_um
+            if abs(run_um) > 4 * self.jitter_um and not agrees(moved_um, run_um):
+                raise self.error("encoder_disagrees", disagreement(moved_um, run_um))
+            self.proven = True
+        finally:
+            if not self.proven:  # refuted, or stopped before it was known
+                self.certain = False
 
     def _check_moving(self) -> Steps[None]:
         """The limit bit tells of the last motion, so it is only looked at while ours lasts."""
         yield from self.check_status()
         if self.status & Status.EXTERNAL_LIMIT:
+            self.certain = (
+                False  # the travel ends before the switches: the axis is not where it reads
+            )
             raise self.error("external_limit", "a limit switch stopped the motor")
 
     def _go(self, command: Command) -> Steps[None]:
@@ -170,8 +183,20 @@ class PmdAxis(PmdController):
             yield from self._go(pmd_protocol.move_to_count(self.address, target, self.speed_hz))
         except PmdNoValueError:  # no echo: what it does is seen below, and a target is absolute
             self.doubts["T"] = "a motion is not confirmed by an echo"
+        watch = _ProgressWatch(self, abs(setpoint_um - self.position_um), self.clock())
+        try:
+            yield from self._follow(setpoint_um, watch)
+        except GeneratorExit:  # stopped on the way
+            if watch.is_stale(self.clock()):
+                self.certain = False  # its encoder may just have died
+            raise
+        yield from self._leave_target_mode()
+        yield from self._forget_stored()
+        yield from self.read_position_surely()
+
+    def _follow(self, setpoint_um: int, watch: "_ProgressWatch") -> Steps[None]:
+        """Until it has arrived. Raises AxisFaultError."""
         told_near = False
-        watch = _ProgressWatch(self, abs(setpoint_um - self.position_um), self._clock())
         while True:
             yield Pause(POLL_PAUSE_S)
             status = yield from self.read_status()
@@ -182,18 +207,18 @@ class PmdAxis(PmdController):
                 # Merely near is believed when it is told twice: the line has no checksum.
                 near = error_um <= self.config.tolerance_um
                 if error_um <= self.jitter_um or (near and told_near):
-                    break
+                    return
                 told_near = near
             if status & Status.TARGET_LIMIT:
                 raise self.error("target_limit", f"stopped at a limit, {error_um:.0f} um short")
             if not status & (Status.TARGET_MODE | Status.RUNNING):
                 if "T" in self.doubts and error_um <= self.jitter_um:
-                    break  # a board that knows no target mode
+                    return  # a board that knows no target mode
                 raise self.error("stopped", f"left target mode {error_um:.0f} um short")
-            watch.check(error_um, self._clock())
-        yield from self._leave_target_mode()
-        yield from self._forget_stored()
-        yield from self.read_position_surely()
+            if watch.is_away(error_um):  # a count that was reset in between looks the same
+                yield from self.read_status()
+                yield from self.check_status()
+            watch.check(error_um, self.clock())
 
     def _leave_target_mode(self) -> Steps[None]:
         try:
@@ -221,7 +246,7 @@ class PmdAxis(PmdController):
     def _run_counted(self, go: Command, microsteps: int, *, anywhere: bool = False) -> Steps[None]:
         phase = yield from self._microstep_phase()
         expected = None if phase is None else (phase + microsteps) % MICROSTEPS_PER_STEP
-        run = _Run(self.position_um, microsteps, self.speed_hz, self._clock())
+        run = _Run(self.position_um, microsteps, self.speed_hz, self.clock())
         self._run = run
         self.at_rest_um = None
         try:
@@ -280,7 +305,7 @@ class PmdAxis(PmdController):
             # `J` reads 0 after a run; during one it reads 1 or +-222, depending on the unit.
             if not status & Status.RUNNING and (yield from self.ask("J")).integer() == 0:
                 return
-            if self._clock() > deadline_s:
+            if self.clock() > deadline_s:
                 raise self.error("motion_timeout", f"runs longer than {run.duration_s:.1f} s")
             yield Pause(POLL_PAUSE_S)
 
@@ -295,7 +320,7 @@ class PmdAxis(PmdController):
         return values[1]
 
     def _estimate_um(self, run: _Run) -> float:
-        part = min(1.0, (self._clock() - run.begun_s) / max(run.duration_s, 1e-6))
+        part = min(1.0, (self.clock() - run.begun_s) / max(run.duration_s, 1e-6))
         return run.from_um + part * pmd_units.um_from_microsteps(self.config, run.microsteps)
 
     # Reference
@@ -349,17 +374,29 @@ class _ProgressWatch:
         self._axis = axis
         self._best_um = distance_um
         self._best_s = now_s
+        self._looks = 0
         self._bound_um = distance_um + RUNAWAY_MARGIN_UM
         count_um = pmd_units.um_per_count(axis.config)
         slowest_um_s = MIN_SPEED_HZ * axis.config.step_um_forward
-        self._window_s = STALL_WINDOW_S + 3 * count_um / slowest_um_s
+        self._resolution_s = 3 * count_um / slowest_um_s
+        self._far_um = FAR_TOLERANCES * axis.config.tolerance_um
+
+    def is_stale(self, now_s: float) -> bool:
+        return now_s - self._best_s > STALE_S
+
+    def is_away(self, error_um: float) -> bool:
+        return error_um > self._bound_um
 
     def check(self, error_um: float, now_s: float) -> None:
         """Raises AxisFaultError."""
+        self._looks += 1
         if error_um < self._best_um:
-            self._best_um, self._best_s = error_um, now_s
-        if error_um > self._bound_um:
+            self._best_um, self._best_s, self._looks = error_um, now_s, 0
+        if self.is_away(error_um):
+            self._axis.certain = False
             raise self._axis.error("runaway", f"moves away, {error_um:.0f} um from the setpoint")
-        if now_s - self._best_s > self._window_s:
+        far = error_um > self._far_um and self._looks >= LOOKS_MIN
+        window_s = (FAR_WINDOW_S if far else STALL_WINDOW_S) + self._resolution_s
+        if now_s - self._best_s > window_s:
             self._axis.certain = False
             raise self._axis.error("stalled", f"stands {error_um:.0f} um from the setpoint")

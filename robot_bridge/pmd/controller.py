@@ -12,7 +12,14 @@ from robot_bridge.daemon.config import AxisConfig
 from robot_bridge.pmd import protocol as pmd_protocol
 from robot_bridge.pmd import units as pmd_units
 from robot_bridge.pmd.line import Pause, Procedure
-from robot_bridge.pmd.protocol import Command, PmdError, PmdNoValueError, PmdTimeoutError, Reply
+from robot_bridge.pmd.protocol import (
+    Command,
+    PmdError,
+    PmdNoValueError,
+    PmdSyntaxError,
+    PmdTimeoutError,
+    Reply,
+)
 from robot_bridge.pmd.status import (
     ERRORS,
     Inputs,
@@ -20,6 +27,7 @@ from robot_bridge.pmd.status import (
     Supply,
     names,
     parse_drive,
+    parse_input_bits,
     parse_inputs,
     parse_status,
     parse_supply,
@@ -63,7 +71,7 @@ class PmdController:
     ) -> None:
         self.config = config
         self.response_delay_us = response_delay_us
-        self._clock = clock
+        self.clock = clock
         self.status = Status(0)
         self.certain = False
         self.needs_setup = True
@@ -79,6 +87,7 @@ class PmdController:
         self.expected_parked: bool | None = None
         self.mark: int | None = None  # what H was set to; None: H cannot be used
         self.can_store = True
+        self.estop = False  # the emergency stop's input is low
         self.limit_wiring = 0  # Y2
         self.proven = False  # the encoder was seen to follow the motor since the board was set up
         self.settings: dict[int, int] = {}  # Y numbers as they were set and read back
@@ -137,8 +146,16 @@ class PmdController:
         return reply
 
     def read_status(self) -> Steps[Status]:
-        reply = yield from self.ask(self.status_body)
+        try:
+            reply = yield from self.ask(self.status_body)
+        except PmdSyntaxError:
+            if self.status_body != "U":
+                raise
+            self.status_body = "U0"  # it does not understand the harmless form
+            reply = yield from self.ask(self.status_body)
         self.status = parse_status(reply.value)
+        if self.config.estop_input is not None:
+            self.estop = not parse_input_bits(reply.value) >> self.config.estop_input & 1
         if reply.retried and not (yield from self.mark_stands()):
             self.status |= Status.RESET  # the answer that told it was lost
         if self.status & Status.RESET:
@@ -186,6 +203,8 @@ class PmdController:
             self.certain = False
             self.needs_setup = True
             raise self.error("controller_reset", "the controller restarted; position uncertain")
+        if self.estop:
+            raise self.error("estop", "the emergency stop is pressed")
         if status & Status.OVERHEAT:
             raise self.error("overheat", "the controller reports overheating")
         if status & Status.VOLTAGE_ERROR:
@@ -212,9 +231,9 @@ class PmdController:
         self.fault = None
 
     def _read_supply_if_due(self) -> Steps[None]:
-        if self._clock() < self._supply_due_s:
+        if self.clock() < self._supply_due_s:
             return
-        self._supply_due_s = self._clock() + SUPPLY_PERIOD_S
+        self._supply_due_s = self.clock() + SUPPLY_PERIOD_S
         reply = yield from self.ask_if_it_can("U2", "supply and temperature are not known")
         try:
             self.supply = parse_supply(reply.value) if reply else None
@@ -275,7 +294,7 @@ class PmdController:
         self.park_shift_um = self.position_um - before_um if self.closed_loop else None
 
     def _await_parked(self, parked: bool) -> Steps[None]:
-        deadline_s = self._clock() + POWER_CHANGE_DEADLINE_S
+        deadline_s = self.clock() + POWER_CHANGE_DEADLINE_S
         while True:
             yield Pause(POLL_PAUSE_S)
             status = yield from self.read_status()
@@ -283,6 +302,6 @@ class PmdController:
                 return
             if status & (Status.RESET | Status.VOLTAGE_ERROR | Status.OVERHEAT):
                 yield from self.check_status()
-            if self._clock() > deadline_s:
+            if self.clock() > deadline_s:
                 wanted = "parked" if parked else "unparked"
                 raise self.error("power", f"not {wanted} after {POWER_CHANGE_DEADLINE_S} s")

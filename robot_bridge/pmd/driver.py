@@ -23,10 +23,11 @@ from robot_bridge.pmd.checks import (
     same_addresses,
 )
 from robot_bridge.pmd.controller import POWER_ON_DELAY_US
+from robot_bridge.pmd.encoder_script import EncoderFound, find_encoder
 from robot_bridge.pmd.homing import home
 from robot_bridge.pmd.line import PmdLine, Procedure, Task
 from robot_bridge.pmd.ports import OpenPort, PmdPorts, SerialPort
-from robot_bridge.pmd.protocol import PmdEchoError, PmdError
+from robot_bridge.pmd.protocol import PmdEchoError, PmdError, PmdTimeoutError
 from robot_bridge.pmd.stop import confirm_stops
 
 log = logging.getLogger(__name__)
@@ -37,7 +38,7 @@ INITIALISE_DEADLINE_S = 10.0
 DECLARE_DEADLINE_S = 2.0
 RECONNECT_PAUSE_S = 1.0
 # Faults at rest that mean that a motor may move.
-NEEDS_STOP = frozenset({"damaged_command", "moving_by_itself"})
+NEEDS_STOP = frozenset({"damaged_command", "moving_by_itself", "estop"})
 
 
 class PmdMotors:
@@ -137,7 +138,7 @@ class PmdMotors:
                 raise MotorError("no_home", f"axis {name}: home_mm is not in the configuration")
             check_set_up(axis)
             homes_um[name] = axis.config.home_um
-        self._begin(homes_um)
+        self._begin({})  # where it ends is not where the reference is
         for name, home_um in homes_um.items():
             self._start(name, home(self._axes[name], home_um), "home")
 
@@ -159,6 +160,41 @@ class PmdMotors:
         self._give_up_tasks()
         for name, axis in self._axes.items():
             self._other[name] = self._line_of(axis).start(axis.park(), f"parking of {name}")
+
+    def unpark(self) -> None:
+        """Power on, before imaging or a measurement that needs it; a move does it by itself."""
+        self._require_ready()
+        self._give_up_tasks()
+        for name, axis in self._axes.items():
+            check_set_up(axis)
+            self._other[name] = self._line_of(axis).start(axis.unpark(), f"unparking of {name}")
+
+    def park_now(self) -> None:
+        """Stop, then take the power off, opened or not. Raises MotorError if unconfirmed."""
+        self.stop()
+        deadline_s = self._clock() + DECLARE_DEADLINE_S
+        for axis in self._axes.values():
+            self._run(axis, axis.park(), "parking", deadline_s)
+
+    def find_encoder(self, name: str) -> EncoderFound:
+        """Let the controller's script find the encoder; the axis runs some 70 um to and fro.
+
+        For an engineer at the controller. Blocks. Raises MotorError.
+        """
+        self._require_ready()
+        axis = self._axis(name)
+        check_set_up(axis)
+        if not axis.closed_loop:
+            raise MotorError("no_encoder", f"axis {name} runs in open loop")
+        self._begin({})
+        found: list[EncoderFound] = []
+
+        def script() -> Procedure:
+            found.append((yield from find_encoder(axis)))
+
+        self._run(axis, script(), "encoder script", self._clock() + INITIALISE_DEADLINE_S)
+        self._run(axis, axis.set_up(), "initialisation", self._clock() + INITIALISE_DEADLINE_S)
+        return found[0]
 
     def measure_um(self, name: str) -> float:
         """The encoder's position, asked for now. Raises MotorError."""
@@ -245,6 +281,8 @@ class PmdMotors:
         for name, task in list(tasks.items()):
             if task.done and task.error is not None:
                 failed = self._note_error(self._axes[name], task.error)
+                if tasks is self._motion and isinstance(task.error, PmdTimeoutError):
+                    self._axes[name].certain = False  # nobody saw where it stopped
             if task.done and tasks is self._other:
                 del tasks[name]
         return failed

@@ -17,7 +17,7 @@ from robot_bridge.pmd.protocol import Command
 from robot_bridge.pmd.status import Inputs
 
 CHUNK_UM = 2000.0  # of a run towards a mechanical end, between two looks at the encoder
-BACK_OFF_UM = 1000.0
+BACK_OFF_UM, PULL_OFF_UM = 1000.0, 500.0
 STANDS = 0.2  # of the way that the motor's steps should make
 INDEX_LATCHED, INDEX_SEARCH = 1, 4
 
@@ -91,6 +91,10 @@ def _home_to_switch(axis: PmdAxis, home_um: int) -> Steps[None]:
         raise _cannot(axis, f"the {name} limit switch did not come back")
     yield pmd_protocol.stop(axis.address)
     yield from axis.declare(home_um)
+    # Off the switch again, or the next homing could not tell it from one that is stuck.
+    yield from _run(axis, -outwards * PULL_OFF_UM)
+    yield from axis.read_position()
+    axis.at_rest_um = axis.position_um
 
 
 def _is_on(inputs: Inputs, name: str) -> bool:

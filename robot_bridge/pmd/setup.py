@@ -39,7 +39,8 @@ def initialise(c: PmdController) -> Steps[None]:
     yield from _identify(c)
     yield from _stop(c)
     c.mark = mark = yield from _read_mark(c)
-    first = yield from _first_status(c)
+    c.status_body = "U" if c.config.estop_input is None else "U4"  # with the inputs
+    first = yield from c.read_status()
     yield from c.read_status()  # what was latched is cleared now
     declared = mark == DECLARED_MARK and not first & Status.RESET
     yield from _probe_storing(c)
@@ -58,14 +59,18 @@ def verify(c: PmdController) -> Steps[None]:
     """Before a move: the board still has the settings that it was given. Raises PmdError."""
     if not c.settings:
         return
-    now = yield from _read_all(c)
-    for number, value in (now or {}).items():
-        if number in c.settings and c.settings[number] != value:
-            c.needs_setup = True
-            c.certain = False
-            raise c.error(
-                "setting", f"Y{number} reads {value}, not {c.settings[number]} as it was set"
-            )
+    differing = yield from _differing(c)
+    if differing:
+        differing = yield from _differing(c)  # it may have been the line
+    for number, value in differing.items():
+        c.needs_setup = True
+        c.certain = False
+        raise c.error("setting", f"Y{number} reads {value}, not {c.settings[number]} as it was set")
+
+
+def _differing(c: PmdController) -> Steps[dict[int, int]]:
+    now = (yield from _read_all(c)) or {}
+    return {n: value for n, value in now.items() if c.settings.get(n, value) != value}
 
 
 def _identify(c: PmdController) -> Steps[None]:
@@ -104,16 +109,6 @@ def _stop(c: PmdController) -> Steps[None]:
         yield pmd_protocol.stop(c.address)
     except PmdNoValueError:
         c.doubts["S"] = "a stop is not confirmed by an echo"
-
-
-def _first_status(c: PmdController) -> Steps[Status]:
-    """Find out which form of the question the controller understands."""
-    c.status_body = "U"
-    try:
-        return (yield from c.read_status())
-    except PmdError:
-        c.status_body = "U0"
-    return (yield from c.read_status())
 
 
 def _read_mark(c: PmdController) -> Steps[int | None]:

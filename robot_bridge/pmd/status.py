@@ -47,6 +47,17 @@ def parse_status(text: str) -> Status:
     return Status(int(digits, 16))
 
 
+def parse_input_bits(text: str) -> int:
+    """in3..in0 as four bits, from a `U4` answer. Raises PmdReplyError."""
+    _, comma, io = text.partition(",")
+    if not comma or len(io.strip()) != 2:
+        raise PmdReplyError(f"status '{text}' has no inputs")
+    try:
+        return int(io.strip()[1], 16)
+    except ValueError:
+        raise PmdReplyError(f"inputs '{io}' are not hexadecimal") from None
+
+
 def format_status(status: Status) -> str:
     return f"{int(status):04x}"
 

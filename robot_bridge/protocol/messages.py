@@ -213,6 +213,16 @@ class CorrectPosition(Message):
     seen_ms: int
 
 
+@dataclass(frozen=True)
+class SetDrives(Message):
+    """Power of the motors off (parked; they hold by friction) or on, for imaging."""
+
+    KIND = 0x19
+    on: bool
+    by: str
+    seen_ms: int
+
+
 # --- bridge to service ------------------------------------------------------------------------
 
 
@@ -304,7 +314,7 @@ MESSAGES: dict[int, type[Message]] = {
     kind.KIND: kind
     for kind in (
         HelloRequest, Heartbeat, Arm, Disarm, Rearm, SetPhase, SetInsertionLock, Move, Home,
-        DeclarePosition, CorrectPosition, Hello, Status, Answer, NoSession,
+        DeclarePosition, CorrectPosition, SetDrives, Hello, Status, Answer, NoSession,
     )
 }  # fmt: skip
 

@@ -79,19 +79,18 @@ class ValidationGate:
 
 
 def move(step: MoveTo) -> ProcedureSteps[Moved]:
-    """Move; a motion that was stopped on its way (link lost, restart) is asked for again, once.
+    """Move; whatever keeps it from arriving ends the procedure.
 
-    The setpoints are absolute, so asking again cannot overshoot. A refusal ends the procedure.
+    It is never asked for again: a robot that was stopped on its way stands where nobody has looked,
+    so the next thing is a look, and that is how a procedure begins.
     """
-    for _ in range(2):
-        moved = yield from ask(step, Moved)
-        if moved.state == "DONE":
-            return moved
-        if moved.state == "REFUSED":
-            break
-        # on its way it left the place where it was planned and measured; its setpoints are absolute
-        step = replace(step, from_um=None, rests_on=None)
-    raise ProcedureFailedError(moved.code, f"the robot did not move: {moved.text}")
+    moved = yield from ask(step, Moved)
+    if moved.state == "DONE":
+        return moved
+    if moved.state == "REFUSED":
+        raise ProcedureFailedError(moved.code, f"the robot did not move: {moved.text}")
+    text = f"the robot was stopped on its way ({moved.text}): look where it stands, then start anew"
+    raise ProcedureFailedError(moved.code, text)
 
 
 def ask_to_confirm(name: str, plan: Plan) -> ProcedureSteps[None]:

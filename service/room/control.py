@@ -23,6 +23,7 @@ from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Procedure
 from room_config.load import Config
 from service.procedure.approach import Arrival
+from service.procedure.calibration import Calibration
 from service.procedure.guide_approach import GuideArrival
 from service.procedure.guide_recording import GuidePlace
 from service.procedure.recording import Place
@@ -35,6 +36,7 @@ from service.procedure.targets import ENTRY_SET, TARGET_SET
 from service.room.alarms import Condition
 from service.room.commands.commands import Commands
 from service.room.context import Room
+from service.room.counts.correct import correct_counts
 from service.room.describe import Describer, describe_robot
 from service.room.execution import Execution, ProcedureAbortedError
 from service.room.integrity import doubt_of, doubt_of_arrival
@@ -316,6 +318,9 @@ class ControlLoop:
             if isinstance(result, Place | GuidePlace):
                 self._make_target(running, result)
             self._record.append_event("procedure_done", body, source="service")
+        known = getattr(result, "calibration", result)
+        if isinstance(known, Calibration):
+            correct_counts(self._record, self._link, known)
 
     def _make_target(self, recorded: Procedure, place: Place | GuidePlace) -> None:
         """The place that was recorded is the target from now on; a needle's line has an entry."""

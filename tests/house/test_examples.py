@@ -1,5 +1,6 @@
 """Each example does what its first lines say."""
 
+import json
 import re
 import subprocess
 import sys
@@ -29,3 +30,16 @@ def test_a_strategy_of_ones_own_is_tried_beside_the_default():
     rows = dict(re.findall(r"(\w+): mean true error ([\d.]+) mm", said))
     assert rows.keys() == {"mine", "adaptive"}
     assert all(float(error_mm) < 0.2 for error_mm in rows.values())
+
+
+def test_the_notebook_runs_from_frames_to_an_honest_displacement():
+    import matplotlib
+
+    matplotlib.use("Agg")
+    notebook = json.loads((EXAMPLES / "template.ipynb").read_text())
+    names: dict[str, object] = {}
+    for cell in notebook["cells"]:
+        if cell["cell_type"] == "code":
+            exec("".join(cell["source"]), names)
+    assert names["mean_error_px"] < 0.02
+    assert 1.2 < names["nees"] < 2.8

@@ -111,6 +111,9 @@ class ModelMotors:
     def park(self) -> None:
         self.stage.parked = True
 
+    def unpark(self) -> None:
+        self.stage.parked = False
+
     def declare_position(self, positions_um: Mapping[str, int]) -> None:
         now_um = {**self.stage.positions_um(), **positions_um}
         self.stage.from_um = self.stage.to_um = now_um

@@ -28,6 +28,7 @@ from robot_bridge.protocol.messages import (
     Message,
     Move,
     Rearm,
+    SetDrives,
     SetInsertionLock,
     SetPhase,
     Status,
@@ -294,6 +295,16 @@ def test_a_position_is_declared_only_at_standstill(folder: Path):
             assert not bench.began_something
 
 
+@pytest.mark.parametrize("on", [False, True])
+def test_drives_go_off_at_standstill_and_on_without_stop_or_lock(folder: Path, on: bool):
+    for case in CASES:
+        with standing(folder, case) as bench:
+            answer = bench.ask(SetDrives(on, "test", bench.now_ms))
+            allowed = not case.moving and not (on and (case.phase in LATCHED or case.locked))
+            assert (answer.code == Code.OK) == allowed
+            assert not bench.began_something
+
+
 def test_a_position_is_corrected_only_at_standstill_and_moves_nothing(folder: Path):
     for case in CASES:
         with standing(folder, case) as bench:
@@ -352,6 +363,7 @@ def test_requests_sent_too_long_ago_are_refused_whatever_they_ask(folder: Path):
                 SetPhase(P.MANUAL.value, "test", old_ms),
                 SetInsertionLock(False, "test", old_ms),
                 DeclarePosition(dict.fromkeys(AXES, 5), "test", old_ms),
+                SetDrives(False, "test", old_ms),
                 CorrectPosition({"xt": 5}, {"xt": 5}, bench.bridge.last_motion, old_ms),
                 Move("late", dict.fromkeys(AXES, 5), None, bench.bridge.last_motion, old_ms),
                 Home("late home", "test", old_ms),
@@ -368,7 +380,8 @@ def test_requests_sent_too_long_ago_are_refused_whatever_they_ask(folder: Path):
 
 def test_there_is_no_other_request_than_those_tested_here():
     tested = {
-        Arm, Rearm, Disarm, SetPhase, SetInsertionLock, DeclarePosition, CorrectPosition, Move, Home
+        Arm, Rearm, Disarm, SetPhase, SetInsertionLock, DeclarePosition, CorrectPosition, Move,
+        Home, SetDrives,
     }  # fmt: skip
     from robot_bridge.daemon.rules import _RULES
 

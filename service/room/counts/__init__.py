@@ -1,0 +1,1 @@
+"""How far the counts of the stages are off, told by what the images show."""
