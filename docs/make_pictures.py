@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import io
+import re
 import sys
 import tempfile
 import time
@@ -22,7 +23,7 @@ from playwright.sync_api import Page, expect
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "service"))
 
-from attended_room import AttendedRoom, arm, calibrated, running_room, wait_for
+from attended_room import AttendedRoom, arm, running_room, wait_for
 from browser import laid_out, running_browser, set_theme
 from page_states import SIZES, confirm_until_ready, layout_faults, states
 
@@ -77,7 +78,7 @@ def take_states(folder: Path) -> None:
         for state in states(page, client):
             taken += take_sizes(page, folder, state)
         room.kill("service")
-        expect(page.locator("body")).to_have_class("stale")
+        expect(page.locator("body")).to_have_class(re.compile(r"\bstale\b"))
         taken += take_sizes(page, folder, "connection-lost")
     with looking_at_a_room("guide", guide=True) as (page, _, client):
         ask_the_guide(client)
@@ -130,7 +131,7 @@ def take_all(page: Page, room: AttendedRoom, client: RoomClient) -> None:
     client.start_calibration()
     wait_for(client.state, lambda s: s.acquisition_request and _is_far_out(client))
     take(page, "2-calibration")
-    state = calibrated(client)
+    state = wait_for(client.state, lambda s: s.calibrated and s.procedure is None, 300.0)
     assert state.measurement is not None
     assert state.measurement.patient_mm is not None
     x, y, z = state.measurement.patient_mm
@@ -158,7 +159,7 @@ def take_all(page: Page, room: AttendedRoom, client: RoomClient) -> None:
     wait_for(client.state, lambda s: s.robot.phase == "EMERGENCY")
     take(page, "6-emergency", "dark", "light")
     room.kill("service")
-    expect(page.locator("body")).to_have_class("stale")
+    expect(page.locator("body")).to_have_class(re.compile(r"\bstale\b"))
     take(page, "7-lost")
 
 

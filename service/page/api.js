@@ -10,6 +10,15 @@ export class Refusal extends Error {
   }
 }
 
+// Of which case is read: of the room's own (empty), or of one before it.
+const caseName = new URLSearchParams(location.search).get("case") ?? "";
+export const readsOldCase = () => caseName;
+
+// The address of something that is read of the case that is looked at.
+export function ofCase(path) {
+  return caseName ? `${path}${path.includes("?") ? "&" : "?"}case=${encodeURIComponent(caseName)}` : path;
+}
+
 let csrf = "";
 export const useCsrf = (token) => { csrf = token ?? ""; };
 

@@ -15,7 +15,7 @@ export const drawHistory = whenChanged(({ measurements, toleranceMm, guide }) =>
   const box = byId("history");
   if (guide) return replace(box, h("p", { class: "quiet" }, words.guide));
   if (!shown.length) return replace(box, h("p", { class: "quiet" }, words.nothing));
-  const low = Math.min(0.01, toleranceMm / 4);
+  const low = Math.min(0.01, (toleranceMm ?? 1) / 4);
   const high = Math.max(1, ...shown.map((m) => 1.3 * (m.error_mm + m.sigma_mm)));
   const y = (value) => {
     const part = Math.log(Math.max(value, low) / low) / Math.log(high / low);
@@ -25,19 +25,19 @@ export const drawHistory = whenChanged(({ measurements, toleranceMm, guide }) =>
   const ticks = [0.01, 0.1, 1, 10, 100].filter((tick) => tick >= low && tick <= high);
   const line = shown.map((m, k) => `${k ? "L" : "M"}${x(k)} ${y(m.error_mm)}`).join("");
   replace(box, s("svg", { viewBox: `0 0 ${WIDE} ${HIGH}`, role: "img",
-    "aria-label": words.picture(mm(shown.at(-1).error_mm, 3), mm(toleranceMm, 3)) },
+    "aria-label": words.picture(mm(shown.at(-1).error_mm, 3), toleranceMm === null ? "" : mm(toleranceMm, 3)) },
   ticks.map((tick) => [
     s("line", { x1: LEFT, x2: WIDE, y1: y(tick), y2: y(tick), class: "thin c-line" }),
     s("text", { x: LEFT - 6, y: y(tick) + 4, "text-anchor": "end" }, String(tick)),
   ]).flat(),
-  s("text", { x: 0, y: HIGH - 3 }, words.unit),
-  s("line", { x1: LEFT, x2: WIDE, y1: y(toleranceMm), y2: y(toleranceMm), class: "thin c-target dash" }),
-  s("text", { x: WIDE, y: y(toleranceMm) - 4, "text-anchor": "end" }, words.tolerance),
+  s("text", { x: 0, y: TOP + 4 }, words.unit),
+  s("text", { x: 0, y: HIGH - 5 }, words.axis),
+  toleranceMm === null ? null : s("line", { x1: LEFT, x2: WIDE, y1: y(toleranceMm), y2: y(toleranceMm), class: "thin c-target dash" }),
+  toleranceMm === null ? null : s("text", { x: WIDE, y: y(toleranceMm) - 4, "text-anchor": "end" }, words.tolerance),
   s("path", { d: line, class: "thin c-fiducial" }),
   shown.map((m, k) => s("g", {},
     s("title", {}, words.point(mm(m.error_mm, 3), mm(m.sigma_mm, 3), m.n_frames, m.method)),
     s("line", { x1: x(k), x2: x(k), y1: y(m.error_mm + m.sigma_mm), y2: y(m.error_mm - m.sigma_mm), class: "thin c-fiducial" }),
     s("circle", { cx: x(k), cy: y(m.error_mm), r: 3.2, class: "f-fiducial" }))),
-  shown.map((m, k) => (k % Math.ceil(shown.length / 10) ? null : s("text", { x: x(k), y: HIGH - 5, "text-anchor": "middle" }, String(m.measurement_id)))),
-  s("text", { x: WIDE, y: HIGH - 5, "text-anchor": "end" }, words.axis)));
+  shown.map((m, k) => (k % Math.ceil(shown.length / 10) ? null : s("text", { x: x(k), y: HIGH - 5, "text-anchor": "middle" }, String(m.measurement_id))))));
 });

@@ -1,6 +1,6 @@
 // The image area: the slice that is shown and the newest reconstruction, window and level, zoom.
 
-import { getPixels } from "./api.js";
+import { getPixels, ofCase } from "./api.js";
 import { h, replace, setText, whenChanged } from "./dom.js";
 import { age, clock } from "./format.js";
 import { distanceFromSlice, pixelFromPatient } from "./geometry.js";
@@ -122,7 +122,7 @@ export class Images {
     const geometry = this.chosen ? this.chosen.geometry : this.state.slice;
     this.list.shown(id);
     try {
-      const pixels = await getPixels(`api/v1/slices/${id}/pixels`);
+      const pixels = await getPixels(ofCase(`api/v1/slices/${id}/pixels`));
       if (this.shownId() !== id) return;
       this.slice.show(geometry, pixels, this.chosen ? words.earlierSlice(id) : words.slice(id));
       this.slice.what.classList.toggle("earlier", Boolean(this.chosen));
@@ -137,7 +137,7 @@ export class Images {
   async fetchSr(id) {
     const geometry = this.state.reconstruction;
     try {
-      this.sr.show(geometry, await getPixels(`api/v1/measurements/${id}/pixels`), words.ofMeasurement(geometry.factor, id, false));
+      this.sr.show(geometry, await getPixels(ofCase(`api/v1/measurements/${id}/pixels`)), words.ofMeasurement(geometry.factor, id, false));
     } catch (error) {
       this.sr.clear(error.message);
     }

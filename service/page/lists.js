@@ -1,6 +1,6 @@
 // Events, slices set aside, the case and the cases before it, targets, moving by hand.
 
-import { get, order } from "./api.js";
+import { get, ofCase, order } from "./api.js";
 import { byId, h, replace, setHidden, setText, whenChanged } from "./dom.js";
 import { act } from "./actions.js";
 import { clock, day, mm, plain } from "./format.js";
@@ -80,9 +80,9 @@ export async function drawAside(state, role) {
   const words = TEXTS.aside;
   const count = state.slices.quarantined ?? 0;
   setText(byId("aside-count"), count ? String(count) : "");
-  const rows = await get("api/v1/slices?state=quarantined&newest=true&limit=30");
+  const rows = await get(ofCase("api/v1/slices?state=quarantined&newest=true&limit=30"));
   showTable(byId("aside"), words, rows, (row) => h("tr", {},
-    h("td", { class: "left" }, h("a", { href: `api/v1/slices/${row.slice_id}/image.png?scale=4`, target: "_blank", rel: "noopener" }, String(row.slice_id))),
+    h("td", { class: "left" }, h("a", { href: ofCase(`api/v1/slices/${row.slice_id}/image.png?scale=4`), target: "_blank", rel: "noopener" }, String(row.slice_id))),
     h("td", { class: "left" }, clock(row.received_s)),
     h("td", { class: "left" }, row.reason || plain(row.reason_code)),
     h("td", {}, role === "operator" && row.offered_hold_id ? useAtHold(row, words) : null)));
@@ -131,7 +131,7 @@ export const drawCase = whenChanged(({ description, case_uid, role }) => {
 // Every target that was set in this case: one that was approached before can be taken again.
 export async function drawTargets(role) {
   const words = TEXTS.targets;
-  const targets = (await get("api/v1/targets")).reverse().slice(0, 30);
+  const targets = (await get(ofCase("api/v1/targets"))).reverse().slice(0, 30);
   showTable(byId("targets"), words, targets, (one) => h("tr", {},
     h("td", { class: "left" }, one.label || clock(one.set_s), one.in_water ? words.tissue : ""),
     h("td", { class: "left" }, one.patient_mm.map((value) => mm(value)).join(", ")),
@@ -154,7 +154,7 @@ function papersOf(folder) {
 export async function drawPast() {
   const cases = await get("api/v1/cases");
   showTable(byId("past"), TEXTS.past, cases, (one) => h("tr", {},
-    h("td", { class: "left" }, one.current ? h("b", {}, one.label || one.folder) : one.label || one.folder),
+    h("td", { class: "left" }, one.current ? h("b", {}, one.label || one.folder) : h("a", { href: `?case=${encodeURIComponent(one.folder)}` }, one.label || one.folder)),
     h("td", { class: "left" }, one.created_s ? day(one.created_s) : ""),
     h("td", { class: "left" }, String(one.slices)), h("td", { class: "left" }, String(one.measurements)), h("td", { class: "left" }, String(one.punctures)),
     h("td", { class: "papers" }, papersOf(one.folder))));

@@ -1,7 +1,7 @@
 // Ties the page together: who is looking, the event stream, and what is drawn from the state.
 
-import { get, heardClock } from "./api.js";
-import { act, Next } from "./actions.js";
+import { get, heardClock, readsOldCase } from "./api.js";
+import { act, Next, showRefusal } from "./actions.js";
 import { drawAlarms } from "./alarms.js";
 import { drawBelief } from "./belief.js";
 import { byId, setHidden, setText, whenChanged } from "./dom.js";
@@ -15,6 +15,7 @@ import { Live } from "./live.js";
 import { askForToken, leave, whoAmI } from "./login.js";
 import { measuredAt } from "./measured_age.js";
 import { drawNeedle } from "./needle_view.js";
+import { showOldCase } from "./old_case.js";
 import { drawProposals } from "./proposals.js";
 import { drawScannerClock, heardFromRoom } from "./scanner_clock.js";
 import { drawStages } from "./stage_map.js";
@@ -100,6 +101,7 @@ async function begin() {
   page.role = me.role;
   setText(byId("who"), me.needs_token ? TEXTS.login.who(me.name, me.role) : "");
   setHidden(byId("leave"), !me.needs_token);
+  if (readsOldCase()) return showOldCase(images, readsOldCase());
   const events = await get("api/v1/events?newest=true&limit=120");
   byId("events").replaceChildren();
   events.reverse().forEach(addEvent);
@@ -123,7 +125,8 @@ async function start() {
     try {
       await begin();
       return setHidden(byId("banner-lost"), true);
-    } catch {
+    } catch (error) {
+      if (error.status === 404) return showRefusal(error.message); // no such case
       showLost((performance.now() - sinceMs) / 1000, false);
       await new Promise((done) => { setTimeout(done, 500); });
     }

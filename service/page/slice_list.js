@@ -1,6 +1,6 @@
 // The case's slices with thumbnails, newest first, as many as fit; any of them can be shown.
 
-import { get } from "./api.js";
+import { get, ofCase } from "./api.js";
 import { h, replace } from "./dom.js";
 import { slicePosition } from "./geometry.js";
 import { clock } from "./format.js";
@@ -39,7 +39,7 @@ export class SliceList {
     this.shownId = shownId;
     this.asked = (this.asked ?? 0) + 1;
     const { asked } = this;
-    const rows = await get(`api/v1/slices?newest=true&limit=${AT_ONCE}`);
+    const rows = await get(ofCase(`api/v1/slices?newest=true&limit=${AT_ONCE}`));
     if (asked !== this.asked) return; // a later answer came first
     this.rows = rows;
     this.draw();
@@ -85,7 +85,7 @@ export class SliceList {
       "aria-label": words.show(row.slice_id, words.kinds[kind] ?? kind, where), title: row.reason || clock(row.received_s),
       onclick: () => this.onChosen(row),
     },
-    h("img", { src: `api/v1/slices/${row.slice_id}/image.png`, alt: "", loading: "lazy" }),
+    h("img", { src: ofCase(`api/v1/slices/${row.slice_id}/image.png`), alt: "", loading: "lazy" }),
     h("span", { class: "tag" }, `${row.slice_id} ${words.kinds[kind] ?? kind}`, where ? h("br", {}) : null, where));
   }
 }

@@ -112,8 +112,8 @@ export const TEXTS = {
 
   history: {
     heading: "Distance to target, measurement by measurement", guide: "With two fiducials it is the needle tip that is steered; its distance is shown at READY.",
-    nothing: "No measurement with a target yet.", tolerance: "tolerance", unit: "mm", axis: "measurement",
-    picture: (mm, tolerance) => `Last distance ${mm} mm, tolerance ${tolerance} mm`,
+    nothing: "No measurement with a target yet.", tolerance: "tolerance", unit: "mm", axis: "no.",
+    picture: (mm, tolerance) => `Last distance ${mm} mm${tolerance ? `, tolerance ${tolerance} mm` : ""}`,
     point: (mm, sigma, frames, method) => `${mm} ± ${sigma} mm, ${many(frames, "slice")}, ${method}`,
   },
   stages: { heading: "Stage positions and travel", top: "top stage", bottom: "bottom stage", noLink: "No link to the robot yet." },
@@ -136,6 +136,9 @@ export const TEXTS = {
   past: {
     heading: "Cases", columns: ["Case", "Begun", "Slices", "Measured", "Punctures", "Documents"], none: "None.",
     report: "report", zip: "zip", reportOf: (name) => `Report of ${name}`, exportOf: (name) => `zip: export of ${name}`,
+  },
+  oldCase: {
+    prompt: (name) => `Case ${name}: read only.`, more: "Nothing here moves the robot. STOP acts on the room as always.", back: "Back to the room",
   },
   clock: {
     heading: "Scanner clock",

@@ -44,7 +44,7 @@ _LOOK_FOR_PARENT_S = 1.0
 
 @dataclass(frozen=True)
 class Question:
-    """A GET request, as far as the routes look at it."""
+    """A GET request, as far as the routes look at it; prefix: of the page's public address."""
 
     path: str
     query: bytes
@@ -52,6 +52,7 @@ class Question:
     scheme: str
     root_path: str
     server: tuple[str, int] | None
+    prefix: str
 
 
 @dataclass(frozen=True)
@@ -124,6 +125,7 @@ def _question(scope: Scope) -> Question:
         scope["scheme"],
         scope.get("root_path", ""),
         scope.get("server"),
+        scope.get("state", {}).get("prefix", ""),
     )
 
 
@@ -208,9 +210,9 @@ def _scope(question: Question) -> Scope:
         "path": question.path,
         "raw_path": question.path.encode(),
         "query_string": question.query,
+        "state": {"prefix": question.prefix},
         "root_path": question.root_path,
         "headers": question.headers,
         "server": question.server,
         "client": None,
-        "state": {},
     }

@@ -9,9 +9,12 @@ import pydicom
 import pytest
 from attended_room import AttendedRoom, arm, calibrated, running_room, wait_for
 from browser import laid_out
+from lone_service import running_service
+from page_states import layout_faults
 from playwright.sync_api import Browser, Page, expect
 from pydicom.uid import generate_uid
 from pynetdicom import AE
+from test_api_documents import copy_case
 
 from service.client import RefusedByServiceError, RoomClient
 
@@ -98,6 +101,30 @@ def test_settings_of_the_case_are_changed_within_bounds_and_recorded(
     with pytest.raises(RefusedByServiceError, match="this room allows"):
         client.change_settings(tolerance_mm=5.0, **goal)
     client.change_settings(tolerance_mm=0.06, **goal)
+
+
+def test_a_case_of_before_is_opened_read_only(
+    browser: Browser, room: AttendedRoom, client: RoomClient, tmp_path: Path
+) -> None:
+    newest = calibrated(client).slice
+    assert newest is not None
+    client.describe_case("the first one")
+    copy_case(room.folder, tmp_path / "old")
+    with running_service(tmp_path) as url:
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        page.goto(url)
+        page.get_by_role("link", name="the first one").click()
+        expect(page.locator("#prompt")).to_contain_text("read only")
+        expect(page.locator(".view .what").first).to_have_text(f"Slice {newest.slice_id}")
+        expect(page.locator(".thumb").first).to_be_visible()
+        expect(page.locator("#events")).to_contain_text("Calibration started")
+        expect(page.locator("#actions button")).to_have_count(0)
+        expect(page.locator("#pick")).to_be_disabled()
+        expect(page.locator("#stop")).to_be_enabled()
+        assert not layout_faults(page)
+        page.goto(f"{url}/?case=nowhere")
+        expect(page.locator("#refusal")).to_contain_text("There is no case 'nowhere'")
+        page.close()
 
 
 def test_with_four_axes_each_fiducials_distance_is_shown_before_each_confirm(
