@@ -48,9 +48,11 @@ RECORDED = {
 }
 OTHERS = {
     CALIBRATION: CALIBRATED | {"shifts_px", "method", "last", "same_mount"},
-    APPROACH: APPROACHED | {"confirm_moves", "proven", "strategy", "stop_rule", "seed"},
+    APPROACH: APPROACHED
+    | {"confirm_moves", "most_frames", "proven", "strategy", "stop_rule", "seed"},
     GUIDE_CALIBRATION: CALIBRATED | {"geometry"},
-    GUIDE_APPROACH: APPROACHED | {"confirm_moves", "proven", "geometry", "lower_plane_mm"},
+    GUIDE_APPROACH: APPROACHED
+    | {"confirm_moves", "most_frames", "proven", "geometry", "lower_plane_mm"},
 }
 
 
