@@ -125,8 +125,14 @@ def begin(page: Page, client: RoomClient, label: str) -> str:
     return state.case_folder
 
 
-def calibrate(page: Page, client: RoomClient) -> None:
+def start_calibration(page: Page) -> None:
+    """In two steps: what will move is said before it does."""
     press(page, "Start the calibration")
+    press(page, "Drive the stages – calibrate")
+
+
+def calibrate(page: Page, client: RoomClient) -> None:
+    start_calibration(page)
     until(client, lambda s: s.procedure == "calibration" or s.question is not None)
     go_through(page, client, lambda s: s.procedure is None and s.calibrated)
 
@@ -155,13 +161,12 @@ def puncture(page: Page, client: RoomClient) -> None:
     press(page, "Record the puncture")
     press(page, "Record the puncture")
     until(client, lambda s: s.punctured)
-    unlock = page.get_by_role("button", name=re.compile("unlock", re.I)).first
-    unlock.click()
-    while client.state().robot.insertion_locked:
-        again = page.get_by_role("button", name=re.compile("unlock", re.I)).first
-        if again.is_visible() and again.is_enabled():
-            again.click()
-        page.wait_for_timeout(100)
+    unlock = page.get_by_role("button", name=re.compile("unlock", re.I))
+    while until(client, lambda s: True).robot.insertion_locked:
+        # two steps, the second elsewhere; a button that has just moved takes no click for a moment
+        with contextlib.suppress(PlaywrightTimeoutError):
+            unlock.last.click(timeout=2000)
+        page.wait_for_timeout(300)
 
 
 def finish(page: Page, client: RoomClient) -> None:
@@ -177,7 +182,7 @@ def one_patient(
     folder = begin(page, client, label)
     arm(page, client)
     if killed:
-        press(page, "Start the calibration")
+        start_calibration(page)
         until(client, lambda s: s.robot.moving)
         hospital.kill("service")
         hospital.start_again("service")
