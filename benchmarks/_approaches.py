@@ -49,7 +49,7 @@ class Cycle:
     def calibrate(self) -> None:
         say("calibrating")
         self._until(lambda s: s.robot.linked)
-        self.client.reset()
+        self.client.reset(self.client.state().robot.taken_um)
         self.client.start_calibration()
         state = self._until(lambda s: s.calibrated and s.procedure is None)
         assert state.measurement is not None

@@ -75,6 +75,10 @@ class Cases:
                 return folder
         raise CaseRecordError(f"There is no case {name!r} in this room's folder of cases.")
 
+    def folder_of(self, name: str) -> Path:
+        """Where a case of this name lies, or would."""
+        return self.only if self.only is not None else self.home / name
+
     def folders(self) -> list[Path]:
         """Every case folder of the room, in the order of their names."""
         above = self.only.parent if self.only is not None else self.home
@@ -99,6 +103,10 @@ class Cases:
                 number += 1
             else:
                 return folder
+
+    def check_may_change(self) -> None:
+        """CasesError where the room has a single case, which is always open."""
+        self._refuse_if_only_one()
 
     def set_open(self, folder: Path | None) -> None:
         """From now on this case is open, or none. CasesError where that cannot be written."""

@@ -32,7 +32,8 @@ class RecordUnavailableError(CaseRecordError):
 class Connection:
     """What every part of the record stands on. Use it in the thread that opened it.
 
-    read_only: nothing is written, not even a migration; a record of another schema is refused.
+    read_only: nothing is written, not even a migration: of a record of an older schema a copy in
+    memory is brought to the present one.
     busy_timeout_s: so long a statement waits for another writer before it is an error.
     """
 
@@ -58,7 +59,7 @@ class Connection:
         sealing.prepare(self._db)
         try:
             if read_only:
-                self._check_schema()
+                self._bring_copy_up()
             else:
                 self._prepare()
         except sqlite3.OperationalError as error:
@@ -78,26 +79,38 @@ class Connection:
         if self._db.execute("PRAGMA user_version").fetchone()[0] == SCHEMA_VERSION:
             return  # the usual case: who only reads does not wait for a writer
         with self.transaction():
-            version = self._db.execute("PRAGMA user_version").fetchone()[0]
-            if version > SCHEMA_VERSION:
-                raise CaseRecordError(
-                    f"{self.case_dir}: the case record has schema version {version}, newer than "
-                    f"this program's {SCHEMA_VERSION}; it was left untouched"
-                )
-            for number in range(version, SCHEMA_VERSION):
-                # executescript would commit the surrounding transaction; the pieces do not
-                for statement in _statements(MIGRATIONS[number]):
-                    self._db.execute(statement)
-                self._db.execute(f"PRAGMA user_version = {number + 1}")
-            sealing.seal_everything(self._db)
+            self._migrate(self._version())
 
-    def _check_schema(self) -> None:
-        version = self._db.execute("PRAGMA user_version").fetchone()[0]
-        if version != SCHEMA_VERSION:
+    def _version(self) -> int:
+        """Of the record's schema. CaseRecordError for one that this program is too old for."""
+        version = int(self._db.execute("PRAGMA user_version").fetchone()[0])
+        if version > SCHEMA_VERSION:
             raise CaseRecordError(
-                f"{self.case_dir}: the case record has schema version {version}, this program "
-                f"reads {SCHEMA_VERSION}; it was left untouched"
+                f"{self.case_dir}: the case record has schema version {version}, newer than "
+                f"this program's {SCHEMA_VERSION}; it was left untouched"
             )
+        return version
+
+    def _migrate(self, version: int) -> None:
+        for number in range(version, SCHEMA_VERSION):
+            # executescript would commit the surrounding transaction; the pieces do not
+            for statement in _statements(MIGRATIONS[number]):
+                self._db.execute(statement)
+            self._db.execute(f"PRAGMA user_version = {number + 1}")
+        sealing.seal_everything(self._db)
+
+    def _bring_copy_up(self) -> None:
+        version = self._version()
+        if version == SCHEMA_VERSION:
+            return
+        copy = sqlite3.connect(":memory:", isolation_level=None)
+        copy.row_factory = sqlite3.Row
+        sealing.prepare(copy)
+        self._db.backup(copy)
+        self._db.close()
+        self._db = copy
+        with self.transaction():
+            self._migrate(version)
 
     def close(self) -> None:
         self._db.close()

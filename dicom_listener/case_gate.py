@@ -1,7 +1,8 @@
 """What the open case takes of what arrives, and to whom it is bound.
 
 A case takes what is of its own patient and study. Before its first used slice it takes only what
-came at one of its holds, so that nothing of a patient on somebody else's table lies in its folder.
+would do for one of its holds, so that nothing of a patient on somebody else's table lies in its
+folder.
 """
 
 from __future__ import annotations
@@ -24,6 +25,21 @@ from dicom_slice.patient import Identity
 from dicom_slice.reasons import Reason, SetAside
 
 HELD, TAKEN = "slice_held", "slices_taken"
+# it would do, and came for a hold of this case: what becomes of the next ones depends on it
+_AT_A_HOLD = frozenset(
+    {
+        Reason.OUTSIDE_HOLD,
+        Reason.AFTER_INCOMPLETE_HOLD,
+        Reason.RECEIVED_AFTER_HOLD,
+        Reason.NOT_EXPECTED,
+        Reason.LATE,
+        Reason.FUTURE,
+        Reason.NO_TIME,
+        Reason.IMPLAUSIBLE_TIME,
+        Reason.CLOCK_UNKNOWN,
+        Reason.NOT_CONFIRMED,
+    }
+)
 _SOURCE = "listener"
 
 
@@ -55,7 +71,7 @@ class CaseGate:
             return SetAside(Reason.OTHER_CASE, f"its study belongs to case {other}")
         if self.binding is not None:
             return why_not_of(self.binding, whose)
-        if any(row.state != "quarantined" for row in rows):
+        if any(row.state != "quarantined" or row.reason_code in _AT_A_HOLD for row in rows):
             return None
         reason = _reason_of(rows, "set aside")
         return SetAside(Reason.NO_SLICE_USED, f"{reason}; no slice of this case was used yet")

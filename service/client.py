@@ -15,6 +15,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, TypeVar
+from urllib.parse import quote
 
 import httpx
 from pydantic import BaseModel, TypeAdapter, ValidationError
@@ -22,6 +23,7 @@ from pydantic import BaseModel, TypeAdapter, ValidationError
 from service.room.state import RoomState
 from service.room.summaries import CaseSummary, KnownTarget, MeasurementBody
 from service.web.schemas import (
+    CaseBegun,
     EventBody,
     Health,
     SessionBody,
@@ -105,9 +107,10 @@ class RoomClient:
         """Who this client is to the service."""
         return self._get("/api/v1/session", SessionBody)
 
-    def events(self, after: int = 0, limit: int = 1000) -> list[EventBody]:
-        """What happened after an event id, oldest first."""
-        return self._list("/api/v1/events", EventBody, after=after, limit=limit)
+    def events(self, after: int = 0, limit: int = 1000, case: str | None = None) -> list[EventBody]:
+        """What happened after an event id, oldest first; in a case by its folder's name."""
+        of_case = {} if case is None else {"case": case}
+        return self._list("/api/v1/events", EventBody, after=after, limit=limit, **of_case)
 
     def slices(
         self,
@@ -193,9 +196,13 @@ class RoomClient:
         body = {"by": self._by, "emergency": emergency}
         self._ask("POST", "/api/v1/stop", json=body, timeout=_STOP_TIMEOUT_S)
 
-    def reset(self) -> None:
-        """Clear a latched stop, take the positions as they stand or are recorded, and arm."""
-        self._order("POST", "/api/v1/reset")
+    def reset(self, positions_um: Mapping[str, int] | None = None) -> None:
+        """Clear a latched stop, and arm.
+
+        positions_um: where axes stand whose position is not certain; robot.taken_um of the state,
+        or better.
+        """
+        self._order("POST", "/api/v1/reset", positions_um=dict(positions_um or {}) or None)
 
     def start_calibration(self, *, guide: bool | None = None) -> int:
         """guide: with both fiducials and four axes; None: as the room is configured."""
@@ -283,6 +290,31 @@ class RoomClient:
     def give_up_slices(self, hold_id: int, why: str = "") -> None:
         """No more slices will come of this hold."""
         self._order("POST", f"/api/v1/holds/{hold_id}/give-up", why=why)
+
+    def begin_case(self, label: str = "", operator: str = "", note: str = "") -> str:
+        """Return the name of the new case's folder."""
+        answer = self._order("POST", "/api/v1/cases", label=label, operator=operator, note=note)
+        return CaseBegun.model_validate_json(answer.text).folder
+
+    def finish_case(self) -> str:
+        """Return the name of the finished case's folder."""
+        answer = self._order("POST", "/api/v1/case/finish")
+        return CaseBegun.model_validate_json(answer.text).folder
+
+    def continue_case(self) -> None:
+        """Go on with a case that was left open on another day."""
+        self._order("POST", "/api/v1/case/continue")
+
+    def reopen_case(self, folder: str) -> None:
+        self._order("POST", f"/api/v1/cases/{quote(folder, safe='')}/reopen")
+
+    def take_slices(self, study: str) -> None:
+        """The slices of a study that wait in the holding area belong to the open case."""
+        self._order("POST", "/api/v1/holding/take", study=study)
+
+    def accept_frame_of_reference(self) -> None:
+        """The table was moved: the new frame of reference counts from now on."""
+        self._order("POST", "/api/v1/case/frame-of-reference")
 
     def describe_case(self, label: str, operator: str = "", note: str = "") -> None:
         self._order("PUT", "/api/v1/case", label=label, operator=operator, note=note)

@@ -57,7 +57,7 @@ def export(
     target = out or Path(f"{case.resolve().name}.{'mrb' if slicer else 'zip'}")
     if target.exists() and not force:
         raise ExportError(f"{target} is there already (--force replaces it)")
-    with CaseRecord(case) as record:
+    with CaseRecord(case, read_only=True) as record:
         members = (_write_scene if slicer else write_export)(record, target)
     print(f"{target}: {members} files")
 

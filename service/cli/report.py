@@ -52,7 +52,7 @@ def report(
 ) -> None:
     """Write one page of a case: images, tables, plots."""
     target = out or Path(f"{case.resolve().name}-report.html")
-    with CaseRecord(case) as record:
+    with CaseRecord(case, read_only=True) as record:
         page = report_page(record)
     fresh = target.with_name(target.name + ".part")
     try:

@@ -157,7 +157,7 @@ def main(words: list[str]) -> int:
     """Make one output; the last line on standard error says why not."""
     case_dir, name = words
     try:
-        with CaseRecord(Path(case_dir)) as record:
+        with CaseRecord(Path(case_dir), read_only=True) as record:
             print(make_output(record, output_of(name)))
     except (OutputError, CaseRecordError, OSError) as error:
         print(error, file=sys.stderr)

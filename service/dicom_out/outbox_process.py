@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 import time
+from pathlib import Path
 
 import structlog
 
@@ -25,7 +26,7 @@ from room_config.shell import configure_logs, on_parent_gone
 from service.dicom_out.errors import OutputError
 from service.dicom_out.make import Output, make_output, outputs_to_send
 from service.dicom_out.outbox_sender import Sender
-from service.dicom_out.outbox_store import OutboxStore
+from service.dicom_out.outbox_store import OutboxStore, cases_with_open_deliveries
 
 PRESENCE = "outbox"
 _LOOK_S = 0.25
@@ -63,6 +64,10 @@ class Maker:
             self._known.add(output.name)
         self._seen, self._after = now, settled
 
+    def has_seen_all(self) -> bool:
+        """Whether the record has nothing that was not looked at."""
+        return self._record.change_count() == self._seen
+
     def _settled_measurement(self) -> int:
         """Up to this one all have ended: they need not be looked at again."""
         last = self._record.last_measurement()  # before those that are open: none slips through
@@ -93,29 +98,64 @@ def sop_instance_uid(path: os.PathLike[str]) -> str:
     return str(pydicom.dcmread(path, specific_tags=["SOPInstanceUID"]).SOPInstanceUID)
 
 
-def serve(config: Config, stop: threading.Event) -> None:
-    """Make and send until `stop`."""
-    case_dir = Cases(*config.room.folders).required()
-    kinds = {one.name: one.kinds for one in config.outputs.destination}
-    while not (case_dir / FILE_NAME).is_file():  # the service is about to begin the case
-        if stop.wait(_LOOK_S):
-            return
-    with (
-        Sole(case_dir, PRESENCE, patience_s=_PATIENCE_S),
-        Presence(case_dir, PRESENCE) as presence,
-        CaseRecord(case_dir) as record,
-        OutboxStore(case_dir) as store,
-    ):
-        store.prepare(kinds)
-        maker = Maker(config, record, store)
-        senders = [Sender(case_dir, one, config.outputs) for one in config.outputs.destination]
-        for sender in senders:
+class CaseOutbox:
+    """The outputs of one case: made and sent until none is left to send. Close it in the end."""
+
+    def __init__(self, config: Config, case_dir: Path) -> None:
+        self._record = CaseRecord(case_dir)
+        self._store = OutboxStore(case_dir)
+        self._store.prepare({one.name: one.kinds for one in config.outputs.destination})
+        self._maker = Maker(config, self._record, self._store)
+        self._senders = [
+            Sender(case_dir, one, config.outputs) for one in config.outputs.destination
+        ]
+        for sender in self._senders:
             sender.start()
-        while not stop.wait(_LOOK_S) and all(sender.is_alive() for sender in senders):
-            presence.beat()
-            maker.look()
-        for sender in senders:
+
+    def look(self) -> None:
+        """Make what is new."""
+        self._maker.look()
+
+    def is_alive(self) -> bool:
+        return all(sender.is_alive() for sender in self._senders)
+
+    def is_done(self) -> bool:
+        """Whether all that there is was made, and is stored everywhere."""
+        return self._maker.has_seen_all() and not self._store.has_open_deliveries()
+
+    def close(self) -> None:
+        for sender in self._senders:
             sender.stop(_END_S)
+        self._store.close()
+        self._record.close()
+
+
+def serve(config: Config, stop: threading.Event) -> None:
+    """Make and send until `stop`: of the open case, and of those before it what is left."""
+    cases = Cases(*config.room.folders)
+    outboxes: dict[Path, CaseOutbox] = {}
+    with (
+        Sole(cases.home, PRESENCE, patience_s=_PATIENCE_S),
+        Presence(cases.home, PRESENCE) as presence,
+    ):
+        waiting = [] if cases.only is not None else cases_with_open_deliveries(cases)
+        try:
+            while not stop.wait(_LOOK_S):
+                presence.beat()
+                now = cases.open
+                for folder in {*waiting, *([] if now is None else [now])} - outboxes.keys():
+                    if (folder / FILE_NAME).is_file():  # else the service is about to begin it
+                        outboxes[folder] = CaseOutbox(config, folder)
+                waiting.clear()
+                for folder, outbox in list(outboxes.items()):
+                    outbox.look()
+                    if not outbox.is_alive():
+                        return
+                    if folder != now and outbox.is_done():
+                        outboxes.pop(folder).close()
+        finally:
+            for outbox in outboxes.values():
+                outbox.close()
 
 
 def main() -> int:

@@ -14,12 +14,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, Self
 
+from case_record.cases import Cases
 from service.dicom_out.make import FOLDER
 
 FILE_NAME = "outbox.sqlite"
 State = Literal["waiting", "sent", "refused", "not_made"]
 STATES: tuple[State, ...] = ("waiting", "sent", "refused", "not_made")
 _BUSY_TIMEOUT_S = 10.0
+_CASES_LOOKED_AT = 20
 _SCHEMA = """
 CREATE TABLE IF NOT EXISTS output (
     output_id        INTEGER PRIMARY KEY,
@@ -73,6 +75,11 @@ class Line:
     failing_since_s: float | None
     reason: str
     last_sent_s: float | None
+
+
+def outbox_file(case_dir: Path) -> Path:
+    """Where a case keeps what became of its outputs."""
+    return case_dir / FOLDER / FILE_NAME
 
 
 class OutboxStore:
@@ -152,6 +159,13 @@ class OutboxStore:
         )
         return [Delivery(**row) for row in rows]
 
+    def has_open_deliveries(self) -> bool:
+        """Whether anything is not stored yet at any destination."""
+        row = self._db.execute(
+            "SELECT 1 FROM delivery WHERE state IN ('waiting', 'refused') LIMIT 1"
+        ).fetchone()
+        return row is not None
+
     def tried(self, name: str, destination: str, state: State, reason: str = "") -> None:
         """What came of one attempt."""
         self._db.execute(
@@ -193,3 +207,15 @@ class OutboxStore:
     def lines(self) -> dict[str, Line]:
         rows = self._db.execute("SELECT * FROM destination")
         return {row["name"]: Line(**row) for row in rows}
+
+
+def cases_with_open_deliveries(cases: Cases) -> list[Path]:
+    """The newest of the room's cases of which something is still to be sent."""
+    found = []
+    for folder in cases.folders()[-_CASES_LOOKED_AT:]:
+        if not outbox_file(folder).is_file():
+            continue
+        with OutboxStore(folder) as store:
+            if store.has_open_deliveries():
+                found.append(folder)
+    return found

@@ -8,7 +8,9 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from collections.abc import Iterable, Iterator, Sequence
+from pathlib import Path
 
 import structlog
 from prometheus_client.core import GaugeMetricFamily
@@ -16,7 +18,7 @@ from prometheus_client.registry import Collector
 
 from case_record.cases import Cases
 from room_config.load import Config
-from service.dicom_out.outbox_store import STATES, Line, OutboxStore
+from service.dicom_out.outbox_store import STATES, Line, OutboxStore, cases_with_open_deliveries
 from service.room.alarms import Condition
 
 _LOOK_S = 0.5
@@ -37,6 +39,7 @@ class OutboxWatch(Collector):
         self._closing = threading.Event()
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
         self._conditions: tuple[Condition, ...] = ()
+        self._folders: set[Path] = set()
         self._lines: dict[str, Line] = {}
         self._counts: dict[tuple[str, str], int] = {}
 
@@ -73,6 +76,8 @@ class OutboxWatch(Collector):
     # In the watch's own thread
 
     def _run(self) -> None:
+        with contextlib.suppress(sqlite3.Error, OSError):
+            self._folders.update(cases_with_open_deliveries(self._cases))
         child = _Child(self._config)
         try:
             while not self._closing.wait(_LOOK_S):
@@ -87,11 +92,21 @@ class OutboxWatch(Collector):
             child.end()
 
     def _look(self) -> None:
-        case_dir = self._cases.open
-        if case_dir is None or not case_dir.is_dir():
-            return
-        with OutboxStore(case_dir) as store:
-            self._lines, self._counts = store.lines(), store.counts()
+        """At the open case, and at those before it of which something is still to be sent."""
+        lines: dict[str, Line] = {}
+        counts: Counter[tuple[str, str]] = Counter()
+        now = self._cases.open
+        for folder in {*self._folders, now} - {None}:
+            if folder is None or not folder.is_dir():
+                continue
+            with OutboxStore(folder) as store:
+                counts.update(store.counts())
+                for name, line in store.lines().items():
+                    if name not in lines or line.failing_since_s is not None:
+                        lines[name] = line
+                done = not store.has_open_deliveries()
+            (self._folders.discard if done and folder != now else self._folders.add)(folder)
+        self._lines, self._counts = lines, dict(counts)
 
     def _what_is_wrong(self, problem: str) -> Iterable[Condition]:
         if problem:

@@ -20,7 +20,14 @@ export function actionsFor(state) {
   const free = idle && robot.linked && !robot.stopped && robot.armed && !state.ready && !robot.insertion_locked;
   const list = [];
   const add = (code, label, run, possible) => { if (possible) list.push({ code, label, run }); };
-  add("reset", robot.stopped ? words.rearm : words.arm, post("reset"),
+  if (!state.case_folder) return list; // see case_desk.js
+  if (state.case_question) {
+    add("needle-out", words.needleOut, "needle-out", robot.linked && robot.insertion_locked);
+    return list;
+  }
+  const stands = Object.keys(robot.taken_um ?? {}).length > 0;
+  const arm = robot.stopped ? words.rearm : words.arm;
+  add("reset", stands ? words.standThere(arm) : arm, post("reset", stands ? { positions_um: robot.taken_um } : {}),
     robot.linked && !robot.moving && (robot.stopped || !robot.armed || !robot.position_certain));
   add("puncture", words.puncture, "puncture", state.ready && robot.insertion_locked && !state.punctured);
   const planned = state.target_patient_mm && (!state.guide || state.entry_patient_mm);
@@ -149,6 +156,8 @@ function moreOf(state) {
   const wanted = state.acquisition_request;
   const place = state.belief?.hold;
   if (wanted) return words.hold(wanted.hold_id, place?.place ?? 1, place?.of ?? 1, wanted.count);
+  const taken = Object.entries(state.robot.taken_um ?? {}).map(([axis, um]) => `${axis} ${mm(um / 1000, 3)} mm`);
+  if (taken.length) return words.taken(taken.join(", "), state.robot.taken_from);
   if (state.procedure) return words.running(TEXTS.procedures[state.procedure] ?? state.procedure.replaceAll("_", " "));
   return state.last_outcome ? words.last(state.last_outcome.replace(/^\w+/, (name) => TEXTS.procedures[name] ?? name)) : "";
 }

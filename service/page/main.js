@@ -5,6 +5,7 @@ import { act, Next, showRefusal } from "./actions.js";
 import { drawAlarms } from "./alarms.js";
 import { drawBelief } from "./belief.js";
 import { byId, setHidden, setText, whenChanged } from "./dom.js";
+import { drawCaseDesk, drawHolding } from "./case_desk.js";
 import { drawNumbers } from "./distance.js";
 import { drawHead, drawLights, showLost, showUp, startHeader } from "./header.js";
 import { drawHistory } from "./history_plot.js";
@@ -52,6 +53,9 @@ function draw(state) {
   drawProposals({ proposals: state.proposals ?? [], role: page.role });
   drawJog({ positions_um: robot.positions_um, possible: page.role === "operator" && state.jog_possible });
   drawCase({ description: state.case, case_uid: state.case_uid, role: page.role });
+  const desk = { folder: state.case_folder, role: page.role, busy: Boolean(state.procedure) };
+  drawCaseDesk({ ...desk, begins: state.cases_begin_here, asks: Boolean(state.case_question) });
+  drawHolding({ ...desk, holding: state.holding });
   drawScannerClock({ clock: state.clock, clock_implies: state.clock_implies, role: page.role });
   drawParts({ robot: { linked: robot.linked, boot_id: robot.boot_id, problem: robot.problem }, processes: state.processes, slices: state.slices });
   if (belief) drawBelief({ ...belief, settings: page.role === "operator" ? belief.settings : null });
@@ -90,6 +94,11 @@ const live = new Live({
   },
 });
 
+function noCase(error) {
+  if (error.code === "no_case") return [];
+  throw error;
+}
+
 async function begin() {
   let me;
   try {
@@ -102,7 +111,7 @@ async function begin() {
   setText(byId("who"), me.needs_token ? TEXTS.login.who(me.name, me.role) : "");
   setHidden(byId("leave"), !me.needs_token);
   if (readsOldCase()) return showOldCase(images, readsOldCase());
-  const events = await get("api/v1/events?newest=true&limit=120");
+  const events = await get("api/v1/events?newest=true&limit=120").catch(noCase);
   byId("events").replaceChildren();
   events.reverse().forEach(addEvent);
   live.open(events.at(-1)?.event_id ?? 0);

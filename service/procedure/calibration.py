@@ -29,16 +29,23 @@ from service.procedure.sensing import (
 from service.procedure.steps import Measured, MoveTo, ProcedureSteps
 
 _ASYMMETRY_CHECK_SIGMA = 5.0
+# twice what the directions of an axis are taken to differ by: a stage that was driven into its stop
+# comes back further than it went out
+_LARGEST_ASYMMETRY = 0.10
 
 
 @dataclass(frozen=True)
 class CalibrationArguments:
+    """last: this robot's last image Jacobian; same_mount: it was not mounted anew since."""
+
     axes: tuple[str, str]
     origin_um: Mapping[str, int]
     move_um: int
     shifts_px: tuple[tuple[float, float], ...]
     gate: ValidationGate
     method: str = "ml"
+    last: Mapping[str, Any] | None = None
+    same_mount: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -119,6 +126,12 @@ def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
         look,
         _check,
     )
+    if arguments.last is not None:
+        last, scale_error = ImageJacobian.from_json(arguments.last), arguments.gate.scale_error
+        same_mount = arguments.same_mount
+        _refuse(
+            lambda: found.jacobian.check_is_of_same_robot(last, scale_error, same_mount=same_mount)
+        )
     return (yield from _refine(found, arguments))
 
 
@@ -134,6 +147,7 @@ def drive_and_learn(
     The last place is the way back: `check` must be content before it is driven, and what is seen
     there must be what was predicted.
     """
+    first: FiducialEstimate | None = None
     before: FiducialEstimate | None = None
     plane: ImagePlane | None = None
     for number, setpoints_um in enumerate(places):
@@ -153,16 +167,41 @@ def drive_and_learn(
             check_prediction(predicted, here, gate)
         if before is not None:
             jacobian = learn_from_move(jacobian, before, here, gate.noise)
-        before = here
+        before, first = here, first or here
     assert before is not None
     assert plane is not None
     check(jacobian)
+    assert first is not None
+    _refuse(lambda: _check_there_and_back(jacobian, first, before, places))
     return Calibration(jacobian, before, plane, seen.measurement_id)
 
 
+def _check_there_and_back(
+    jacobian: ImageJacobian,
+    first: FiducialEstimate,
+    last: FiducialEstimate,
+    places: Sequence[Mapping[str, int]],
+) -> None:
+    """Where the fiducial is not back where it was, an axis went another way out than back."""
+    seen_mm = np.linalg.solve(jacobian.mean_columns, last.plane_mm - first.plane_mm)
+    for axis, moved_mm in zip(jacobian.axes, seen_mm.tolist(), strict=True):
+        said_mm = (last.setpoints_um[axis] - first.setpoints_um[axis]) / 1000
+        way_mm = max(abs(place[axis] - first.setpoints_um[axis]) for place in places) / 1000
+        if not abs(moved_mm - said_mm) <= _LARGEST_ASYMMETRY * way_mm:
+            raise CalibrationError(
+                f"axis {axis}: the way out and the way back of {way_mm:g} mm differ by "
+                f"{abs(moved_mm - said_mm):.2f} mm, at most {_LARGEST_ASYMMETRY * way_mm:.2f} are "
+                "allowed: did a stage meet its stop, or stand elsewhere than was said?"
+            )
+
+
 def _check(jacobian: ImageJacobian) -> None:
+    _refuse(jacobian.check)
+
+
+def _refuse(check: Callable[[], None]) -> None:
     try:
-        jacobian.check()
+        check()
     except CalibrationError as error:
         raise ProcedureFailedError("calibration", str(error)) from error
 

@@ -24,6 +24,7 @@ Array = NDArray[np.float64]
 _VAGUE_SCALE = 2.0
 _SCALE_RANGE = (0.6, 1.6)
 SMALLEST_ANGLE_DEG = 60.0
+_CHANGE_SIGMAS = 5.0
 
 
 class CalibrationError(Exception):
@@ -92,6 +93,30 @@ class ImageJacobian:
         covariance = rest @ self.covariance @ rest.T + gain @ noise_mm2 @ gain.T
         return ImageJacobian(self.axes, columns.reshape(self.columns.shape), covariance)
 
+    def check_is_of_same_robot(
+        self, last: ImageJacobian, scale_error: float, *, same_mount: bool
+    ) -> None:
+        """Raise CalibrationError where this is not `last` within what both can be wrong by.
+
+        same_mount: the robot has not been mounted anew since, so that directions compare as well;
+        otherwise lengths and angles do. scale_error: of one move's length, as a fraction.
+        """
+        if last.axes != self.axes:
+            return
+        mine, others = self.mean_columns, last.mean_columns
+        if not same_mount:
+            mine, others = _shape(mine), _shape(others)
+        for index, axis in enumerate(self.axes):
+            length = float(np.linalg.norm(others[:, index]))
+            change = float(np.linalg.norm(mine[:, index] - others[:, index]))
+            allowed = _CHANGE_SIGMAS * np.sqrt(2.0) * scale_error * length
+            if not change <= allowed:
+                raise CalibrationError(
+                    f"axis {axis}: the fiducial moves otherwise than at the last calibration of "
+                    f"this robot, by {change:.3f} mm per mm (allowed {allowed:.3f}): look for what "
+                    "is loose or in the way, and whether the stages stand where they are said to"
+                )
+
     def check(self) -> None:
         """Raise CalibrationError unless each of two axes moves the fiducial about 1 mm per mm."""
         lengths = np.linalg.norm(self.columns, axis=0)
@@ -124,3 +149,8 @@ class ImageJacobian:
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> ImageJacobian:
         return cls(tuple(value["axes"]), np.array(value["columns"]), np.array(value["covariance"]))
+
+
+def _shape(columns: Array) -> Array:
+    """The columns turned and mirrored into a standard pose: what is left is lengths and angles."""
+    return np.asarray(np.linalg.cholesky(columns.T @ columns).T)

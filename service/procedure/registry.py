@@ -16,7 +16,7 @@ from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_recording import GuidePlace, GuideRecordingArguments, record_guide
 from service.procedure.identity import ProofArguments
 from service.procedure.recording import Place, RecordingArguments, record_place
-from service.procedure.scan_frame import frame_of, other_place_since
+from service.procedure.scan_frame import calibration_good_since, frame_of, other_place_since
 from service.procedure.sensing import ValidationGate, move
 from service.procedure.steps import MoveTo, ProcedureSteps
 
@@ -110,10 +110,14 @@ def latest_calibration(record: CaseRecord, *, guide: bool = False) -> Calibratio
     """What the last procedure that came to its end knew; a later calibration replaces it. None
     without one, and once slices of another frame of reference have come.
 
+    None where there is none, or none that is good any more.
+
     guide: of both fiducials and four axes, else of one and two.
     """
     calibration = record.last_procedure(GUIDE_CALIBRATION if guide else CALIBRATION, "done")
     if calibration is None or calibration.result is None:
+        return None
+    if calibration.begun_seq <= calibration_good_since(record):
         return None
     newest = calibration
     for name in (GUIDE_APPROACH, GUIDE_RECORDING) if guide else (APPROACH, RECORDING):

@@ -19,7 +19,7 @@ from case_record.rows import Event
 from service.procedure.guide_geometry import GuideGeometry, state_on_line
 from service.procedure.kinematics import KinematicsError, line_from_entry_and_target
 from service.procedure.plane import ImagePlane
-from service.procedure.scan_frame import ScanFrame, other_place_since
+from service.procedure.scan_frame import ScanFrame, other_place_since, places_good_since
 
 Array = NDArray[np.float64]
 TARGET_SET, TARGET_WITHDRAWN = "target_set", "target_withdrawn"
@@ -48,18 +48,18 @@ class Target:
 
 
 def current_target(record: CaseRecord) -> Target | None:
-    """The target that was set last, unless it was withdrawn since."""
+    """The target that was set last, unless it was withdrawn or the table moved since."""
     last = record.last_event(TARGET_SET)
     withdrawn = record.last_event(TARGET_WITHDRAWN)
     if last is None or (withdrawn is not None and withdrawn.event_id > last.event_id):
         return None
-    return target_of(last)
+    return target_of(last) if last.seq > places_good_since(record) else None
 
 
 def current_entry(record: CaseRecord) -> tuple[float, float, float] | None:
-    """The planned skin point that was set last, patient mm (LPS)."""
+    """The planned skin point that was set last, patient mm (LPS); None if the table moved since."""
     event = record.last_event(ENTRY_SET)
-    if event is None:
+    if event is None or event.seq <= places_good_since(record):
         return None
     x, y, z = event.body["patient_mm"]
     return x, y, z
@@ -68,7 +68,19 @@ def current_entry(record: CaseRecord) -> tuple[float, float, float] | None:
 def current_entry_number(record: CaseRecord) -> int | None:
     """The number of the event by which the present entry point was set."""
     event = record.last_event(ENTRY_SET)
-    return None if event is None else event.event_id
+    if event is None or event.seq <= places_good_since(record):
+        return None
+    return event.event_id
+
+
+def target_that_can_be_taken(record: CaseRecord, number: int) -> Target:
+    """A target of the case by its number. TargetError where it is none, or none any more."""
+    event = next((e for e in record.events_of_kind(TARGET_SET) if e.event_id == number), None)
+    if event is None:
+        raise TargetError(f"this case has no target number {number}")
+    if event.seq <= places_good_since(record):
+        raise TargetError("it was set before the table was moved: pick it again on new slices")
+    return target_of(event)
 
 
 def all_targets(record: CaseRecord) -> list[Target]:

@@ -18,8 +18,8 @@ from typing import Any
 
 import structlog
 
-from case_record.cases import Cases
-from case_record.record import CaseRecord, CaseRecordError
+from case_record.cases import Cases, CasesError
+from case_record.record import CaseRecord, CaseRecordError, RecordUnavailableError
 from case_record.rows import Procedure
 from room_config.load import Config
 from service.procedure.approach import Arrival
@@ -34,10 +34,13 @@ from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steps import Outcome, Step
 from service.procedure.targets import ENTRY_SET, TARGET_SET
 from service.room.alarms import Condition
+from service.room.cases.between import BetweenCases
+from service.room.cases.life import CaseLife, is_finished, set_at_rest
 from service.room.commands.commands import Commands
+from service.room.conditions import conditions
 from service.room.context import Room
 from service.room.counts.correct import correct_counts
-from service.room.describe import Describer, describe_robot
+from service.room.describe import Describer, ProcessLook, describe_robot
 from service.room.execution import Execution, ProcedureAbortedError
 from service.room.integrity import doubt_of, doubt_of_arrival
 from service.room.link import RoomLink
@@ -74,6 +77,8 @@ _WHILE_MOVING = frozenset(
         "note_registration",
     }
 )
+# answered when the case that is open then is shown
+_CHANGES_CASE = frozenset({"begin_case", "finish_case", "reopen_case"})
 # the safe direction, and what is only written down: never too late, and not void after a STOP
 _ALWAYS = frozenset({"note_stop", "abort", "lock_motion", "describe_case", "compare_clocks"})
 OLDEST_ORDER_S = 3.0
@@ -106,6 +111,10 @@ class ControlLoop:
         """
         self._config = config
         self._cases = Cases(*config.room.folders)
+        self._processes = ProcessLook(self._cases.home)
+        self._unusable: Path | None = None
+        self._problem = ""
+        self._owed: list[tuple[Future[Any], Any]] = []
         self._link = link
         self._others_wrong = others_wrong
         self._link.client.while_moving = self._while_moving
@@ -121,7 +130,7 @@ class ControlLoop:
         self._doubts: dict[Path, str] = {}
         self._failed_at: tuple[int, str] | None = None
         self._said_s = -_SAID_AGAIN_S
-        self._commands: Commands | None = None
+        self._commands: Commands | BetweenCases | None = None
         self._stops = StopLatch()
 
     @property
@@ -206,32 +215,93 @@ class ControlLoop:
 
     def _work_until_it_fails(self) -> None:
         try:
-            with CaseRecord(
-                self._cases.required(), create=True, busy_timeout_s=_BUSY_TIMEOUT_S
-            ) as record:
+            folder = self._folder_to_serve()
+            if folder is None:
+                self._wait_for_case()
+                return
+            with self._opened(folder) as record:
                 self._serve(record)
-        except _Closing:
+        except (_Closing, _UnusableError):
             return
         except Exception as error:
             if self._trouble.begin(error):
                 log.exception("the control loop holds")
             self._hold()
 
+    def _folder_to_serve(self) -> Path | None:
+        """The open case's; None if there is none, or it cannot be used (`_problem`)."""
+        try:
+            folder = self._cases.open
+        except CasesError as error:
+            self._problem = f"{error}."
+            return None
+        if folder != self._unusable:
+            self._unusable, self._problem = None, ""
+        return folder if self._unusable is None else None
+
+    def _opened(self, folder: Path) -> CaseRecord:
+        """The record of the open case, or it is unusable: that ends the case and not the room."""
+        only = self._cases.only is not None
+        try:
+            return CaseRecord(folder, create=only, busy_timeout_s=_BUSY_TIMEOUT_S)
+        except RecordUnavailableError:
+            raise
+        except CaseRecordError as error:
+            if only:
+                raise
+            log.error("the open case cannot be used", folder=str(folder), why=str(error))
+            self._unusable = folder
+            self._problem = f"Case {folder.name} cannot be used: {error}."
+            raise _UnusableError from error
+
     def _serve(self, record: CaseRecord) -> None:
         case = record.start_case(self._config.room.name, seed=0)
+        if self._cases.only is None and is_finished(record):
+            self._cases.set_open(None)  # a crash came in between
+            return
         if record.case_dir not in self._doubts:
             self._doubts[record.case_dir] = doubt_of(record)
         record.doubt = self._doubts[record.case_dir]
         self._trouble.settle(record)
+        life = CaseLife(self._cases, record, time.time())
+        if life.asks:
+            set_at_rest(record)
         execution = Execution(self._config, record, self._link, self._tick)
-        self._commands = Commands(Room(self._config, record, self._link, execution, self._stops))
+        room = Room(self._config, record, self._link, execution, self._stops)
         self._record, self._execution = record, execution
-        self._describer = Describer(self._config, record, self._link, self._wrong)
-        while True:
+        self._describer = Describer(self._config, record, self._link, life, self._wrong)
+        self._commands = Commands(room, life)
+        self._publish()
+        while self._cases.open == record.case_dir:
             self._tick()
             running = record.running_procedure()
             if running is not None:
                 self._run_one(running, case.case_uid)
+        self._commands = None
+
+    def _wait_for_case(self) -> None:
+        """No case is open: keep the link, answer STOP, until somebody begins one."""
+        between = BetweenCases(self._config, self._cases, self._problem)
+        self._commands = between
+        shown_s = 0.0
+        while self._folder_to_serve() is None:
+            if self._closing.is_set():
+                raise _Closing
+            if time.monotonic() - shown_s > _PUBLISH_EVERY_S:
+                shown_s = time.monotonic()
+                self._publish_between(between)
+            self._answer_queue()
+            self._link.pump(_TICK_S)
+        self._commands = None
+
+    def _publish_between(self, between: BetweenCases) -> None:
+        robot = describe_robot(self._link, self._state.robot)
+        processes = self._processes.processes()
+
+        def wrong(state: RoomState) -> list[Condition]:
+            return [*between.conditions(), *conditions(state), *self._others_wrong()]
+
+        self._show(between.describe(self._state, robot, processes, wrong, time.time()))
 
     def _wrong(self) -> Sequence[Condition]:
         """What else is wrong than the state shows."""
@@ -243,7 +313,7 @@ class ControlLoop:
 
     def _hold(self) -> None:
         """For a while: keep the link, show what is wrong, refuse orders; then it is tried again."""
-        if self._commands is not None and self._execution.aborting is not None:
+        if isinstance(self._commands, Commands) and self._execution.aborting is not None:
             self._trouble.abort = self._execution.aborting
         self._commands = None
         until_s = time.monotonic() + _TRIED_AGAIN_S
@@ -366,7 +436,7 @@ class ControlLoop:
         self._publish_if_due()
 
     def _answer_queue(self, *, moving: bool = False) -> None:
-        while self._commands is not None:
+        while self._commands is not None and not self._owed:
             try:
                 asked = self._queue.get_nowait()
             except queue.Empty:
@@ -393,7 +463,7 @@ class ControlLoop:
             else:
                 asked.future.set_exception(self._trouble.refusal())
 
-    def _answer(self, commands: Commands, asked: _Asked, moving: bool) -> None:
+    def _answer(self, commands: Commands | BetweenCases, asked: _Asked, moving: bool) -> None:
         """Carry out what was asked; the state that shows it is published before the answer.
 
         Raises where the record is at fault, after whoever asked was told.
@@ -404,9 +474,13 @@ class ControlLoop:
             self._check(asked, moving)
             result = commands.carry_out(asked.name, asked.arguments)
             log.info("command", command=asked.name, by=asked.arguments.get("by"))
-            if not moving:
-                self._keep_ready()
-            self._publish()
+            if asked.name in _CHANGES_CASE:
+                self._owed.append((asked.future, result))
+                return
+            if isinstance(commands, Commands):
+                if not moving:
+                    self._keep_ready()
+                self._publish()
             asked.future.set_result(result)
         except (ConflictError, CaseRecordError) as error:
             log.info("refused", command=asked.name, by=asked.arguments.get("by"), why=str(error))
@@ -462,6 +536,14 @@ class ControlLoop:
     def _show(self, state: RoomState) -> None:
         self._published_at_s = time.monotonic()
         self._state = state
+        if self._owed and (state.case_folder is None) == (self._folder_to_serve() is None):
+            while self._owed:
+                future, result = self._owed.pop()
+                future.set_result(result)
+
+
+class _UnusableError(Exception):
+    """The case that is named as open cannot be used; nothing in it was changed."""
 
 
 class _Closing(Exception):

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import Any
 
-from case_record.cases import Cases
 from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, Procedure, SliceRow
@@ -22,6 +22,8 @@ from service.room.alarms import AlarmBook, Condition
 from service.room.belief.describe import describe_belief
 from service.room.belief.goal import effective, goal_tolerance_mm
 from service.room.belief.state import BeliefState
+from service.room.cases.held import HeldSlices, arriving
+from service.room.cases.life import QUESTION, CaseLife
 from service.room.conditions import HANGS, conditions
 from service.room.context import now_of
 from service.room.describe_measurement import (
@@ -37,6 +39,7 @@ from service.room.motion_allowed import may_start
 from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
 from service.room.prompt import is_calibrated, is_punctured, next_action, outcome_text, prompt
 from service.room.proposals import ProposalBook
+from service.room.robot.whereabouts import source_of, taken_to_stand
 from service.room.scanner_clock import clock_update
 from service.room.state import (
     AcquisitionState,
@@ -68,17 +71,18 @@ class Describer:
         config: Config,
         record: CaseRecord,
         link: RoomLink,
+        life: CaseLife,
         others_wrong: Callable[[], Sequence[Condition]] = tuple,
     ) -> None:
         self._others_wrong = others_wrong
         self._config = config
-        self._home = Cases(*config.room.folders).home
+        self._life = life
+        self._held = HeldSlices(life.cases)
+        self._look = ProcessLook(life.cases.home)
         self._record = record
         self._link = link
         self._alarms = AlarmBook()
         self._proposals = ProposalBook()
-        self._processes: list[ProcessState] = []
-        self._look_at_s = 0.0
         self._around_id = 0
         self._believed_at = (-1, -1)
 
@@ -98,9 +102,14 @@ class Describer:
             update={
                 "at_s": time.time(),
                 "case_uid": case.case_uid if case else "",
+                "case_folder": record.case_dir.name,
+                "case_question": QUESTION if self._life.asks else "",
+                "holding": self._held.look(record),
                 "case": _case(record),
                 **_procedures(record, execution),
-                "prompt": prompt(config, record, link, execution, found) + _marked(arrival),
+                "prompt": QUESTION
+                if self._life.asks
+                else prompt(config, record, link, execution, found) + _marked(arrival),
                 "ready": arrival is not None,
                 "ready_lost": _lost_ready(found),
                 "next_action": next_action(config, record, link, execution, found),
@@ -120,7 +129,7 @@ class Describer:
                 "target_lost": LostState(code="target_void", text=void) if void else None,
                 **_error(settings, record, None if void else target, void, now),
                 "event_id": record.last_event_id(),
-                "processes": self._look_at_processes(),
+                "processes": self._look.processes(),
                 "proposals": self._proposals.update(record),
                 "tolerance_mm": goal_tolerance_mm(settings),
                 "belief": self._believed(before),
@@ -128,7 +137,8 @@ class Describer:
         )
         other = _other(record, state.other_fiducial, now)
         state = state.model_copy(update={"other_fiducial": other})
-        alarms = self._alarms.update([*conditions(state), *self._others_wrong()], record)
+        wrong = [*conditions(state), *arriving(record), *self._others_wrong()]
+        alarms = self._alarms.update(wrong, record)
         state = state.model_copy(update={"alarms": alarms})
         same = _timeless(state) == _timeless(before)
         return state.model_copy(update={"revision": before.revision + (not same)})
@@ -151,7 +161,16 @@ class Describer:
         self._believed_at = changes
         return describe_belief(self._config, self._record)
 
-    def _look_at_processes(self) -> list[ProcessState]:
+
+class ProcessLook:
+    """How the other processes of the room do; looked at now and then."""
+
+    def __init__(self, home: Path) -> None:
+        self._home = home
+        self._processes: list[ProcessState] = []
+        self._look_at_s = 0.0
+
+    def processes(self) -> list[ProcessState]:
         if time.monotonic() >= self._look_at_s:
             self._look_at_s = time.monotonic() + _LOOK_EVERY_S
             self._processes = [
@@ -163,7 +182,7 @@ class Describer:
 
 def _condition(seen: bool, running: bool, beat_age_s: float) -> dict[str, str]:
     if not seen:
-        return {"condition": "none", "detail": "has not run on this case yet"}
+        return {"condition": "none", "detail": "has not run in this room yet"}
     if not running:
         return {"condition": "down", "detail": "has ended"}
     if beat_age_s > _BEAT_IS_LOST_S:
@@ -178,6 +197,7 @@ def describe_robot(link: RoomLink, before: RobotState) -> RobotState:
     status = link.status
     if status is None:
         return before.model_copy(update={"linked": False, "problem": link.problem})
+    taken = taken_to_stand(status)
     return RobotState(
         linked=True,
         problem="",
@@ -192,6 +212,8 @@ def describe_robot(link: RoomLink, before: RobotState) -> RobotState:
         travel_um=link.travel_um,
         fault=status.fault,
         boot_id=status.boot_id,
+        taken_um={axis: one.at_um for axis, one in taken.items()},
+        taken_from=source_of(taken) if taken else "",
     )
 
 

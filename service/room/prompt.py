@@ -13,6 +13,7 @@ from service.procedure.targets import current_entry, current_target, why_void_ta
 from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.present import Readiness
+from service.room.robot.whereabouts import in_words, taken_to_stand
 
 
 def prompt(
@@ -37,6 +38,8 @@ def _idle_prompt(
         return "READY: make the puncture."
     if status.phase is WorkPhase.EMERGENCY:
         return "EMERGENCY: the drives are parked. See to the patient and the needle, then re-arm."
+    if not status.position_certain and not status.moving:
+        return f"{in_words(taken_to_stand(status))} Look, and say whether they do."
     if status.stopped:
         return f"Stopped ({plain_words(status.stop_reason)}). Re-arm to continue."
     if found is not None:

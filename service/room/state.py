@@ -18,7 +18,11 @@ class _Frozen(BaseModel):
 
 
 class RobotState(_Frozen):
-    """The bridge as it last said it was; `linked` False: what follows is old."""
+    """The bridge as it last said it was; `linked` False: what follows is old.
+
+    taken_um: where axes that are not certain are taken to stand, `taken_from` what; to be confirmed
+    by whoever arms.
+    """
 
     linked: bool = False
     problem: str = "not connected yet"
@@ -33,6 +37,8 @@ class RobotState(_Frozen):
     travel_um: dict[str, tuple[int, int]] = {}
     fault: str | None = None
     boot_id: str = ""
+    taken_um: dict[str, int] = {}
+    taken_from: str = ""
 
 
 class AcquisitionState(_Frozen):
@@ -191,6 +197,22 @@ class CaseState(_Frozen):
     note: str = ""
 
 
+class HeldState(_Frozen):
+    """Slices of one study that wait in the holding area; of another patient's no more than that.
+
+    study: empty where it is not to be shown, or not known. code, reason: of the newest one.
+    """
+
+    study: str = ""
+    code: str
+    reason: str
+    description: str = ""
+    slices: int
+    first_received_s: float
+    last_received_s: float
+    may_be_taken: bool = False
+
+
 class ProcessState(_Frozen):
     """One of the room's processes: `up`, `old` (hangs or is quiet), `down`, `none` (not seen)."""
 
@@ -217,6 +239,10 @@ class RoomState(_Frozen):
     room: str
     virtual: bool
     case_uid: str = ""
+    case_folder: str | None = None
+    cases_begin_here: bool = False
+    case_question: str = ""
+    holding: list[HeldState] = []
     procedure: str | None = None
     procedure_id: int | None = None
     last_outcome: str = ""
@@ -267,6 +293,7 @@ class RoomState(_Frozen):
             at_s=time.time(),
             service_id=uuid.uuid4().hex,
             room=config.room.name,
+            cases_begin_here=config.room.cases_dir is not None,
             virtual=config.room.virtual,
             arrival_mode=config.listener.arrival_mode,
             guide=config.service.guide is not None,

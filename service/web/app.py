@@ -30,10 +30,12 @@ from service.web.access import Access, AccessRules
 from service.web.event_stream import Broadcast
 from service.web.metrics import Receivers, RoomMetrics
 from service.web.orders import Orders
+from service.web.papers import Papers
 from service.web.problems import Problem, add_problems, problem, responses
 from service.web.readers import Readers
 from service.web.request_guard import Gate
 from service.web.routes.access import access_router
+from service.web.routes.cases import case_router
 from service.web.routes.documents import document_router
 from service.web.routes.images import measurement_image_router, slice_image_router
 from service.web.routes.live import live_router
@@ -74,7 +76,11 @@ def create_app(
     client = PumpedClient(service.bridge_link, name="service", heartbeat_s=service.heartbeat_s)
     link = RoomLink(client, _log_link)
     outbox = OutboxWatch(config)
-    loop = ControlLoop(config, link, outbox.conditions, on_failure)
+    cases = Cases(*config.room.folders)
+    papers = Papers(cases)
+    loop = ControlLoop(
+        config, link, lambda: [*outbox.conditions(), *papers.conditions()], on_failure
+    )
     broadcast = Broadcast(config, loop)
     receivers = None if scene is None else scene(loop)
 
@@ -83,6 +89,7 @@ def create_app(
         loop.start()
         broadcast.start()
         outbox.start()
+        papers.start()
         if receivers is not None:
             await receivers.start()
         announce()
@@ -94,6 +101,7 @@ def create_app(
             await asyncio.to_thread(broadcast.close)
             await asyncio.to_thread(loop.close)
             await asyncio.to_thread(outbox.close)
+            papers.close()
             for end in ending:
                 end()
 
@@ -112,7 +120,7 @@ def create_app(
     app.add_middleware(Readers, config=config, stopping=ending)
     app.add_middleware(Gate, access=access, uses_tls=uses_tls, public_url=service.public_url)
     add_problems(app)
-    app.state.cases = Cases(*config.room.folders)
+    app.state.cases = cases
     orders = Orders(loop)
     for router in (
         stop_router(loop),
@@ -131,6 +139,7 @@ def create_app(
         proposal_router(orders),
         procedure_router(orders),
         clerk_router(orders),
+        case_router(loop, orders, papers),
         access_router(access, cookie_path=urlsplit(service.public_url).path or "/"),
     ):
         app.include_router(router)

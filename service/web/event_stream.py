@@ -47,6 +47,7 @@ class Broadcast:
         self._told_s = 0.0
         self._events: deque[tuple[int, bytes]] = deque(maxlen=_KEPT_EVENTS)
         self._newest_id = 0
+        self._folder = self._told_folder = loop.state.case_folder
         self._turn = asyncio.Event()
         self._looking_back = asyncio.Lock()
         self.viewers = 0
@@ -72,27 +73,36 @@ class Broadcast:
                 self._closing.wait(_AGAIN_S)
 
     def _watch_record(self) -> None:
-        while not self._loop.state.case_uid:
-            if self._closing.wait(_WATCH_S):
-                return
-            self._beat_if_due()
-        with CaseRecord(self._cases.required()) as record:
+        """Tell what happens in one case, or while none is open."""
+        folder = self._loop.state.case_folder
+        if folder != self._folder:
+            self._folder, self._newest_id = folder, 0
+        if folder is None:
+            self._watch_states(folder, None)
+            return
+        with CaseRecord(self._cases.folder_of(folder)) as record:
             if not self._newest_id:
                 self._newest_id = max(0, record.last_event_id() - _KEPT_EVENTS)
-            revision = -1
-            while not self._closing.wait(_WATCH_S):
-                state = self._loop.state
-                if state.revision == revision:
-                    self._beat_if_due()
-                    continue
-                revision = state.revision
-                events = record.events(self._newest_id) if state.event_id > self._newest_id else []
-                messages = [(event.event_id, _event_message(event)) for event in events]
-                if events:
-                    self._newest_id = events[-1].event_id
-                self._tell(_state_message(state.model_dump_json()), messages)
-                # many viewers cost no more than a few: each is told less often
-                self._closing.wait(_LEAST_BETWEEN_STATES_S + self.viewers * _FOR_EACH_VIEWER_S)
+            self._watch_states(folder, record)
+
+    def _watch_states(self, folder: str | None, record: CaseRecord | None) -> None:
+        revision = -1
+        while not self._closing.wait(_WATCH_S):
+            state = self._loop.state
+            if state.case_folder != folder:
+                return
+            if state.revision == revision:
+                self._beat_if_due()
+                continue
+            revision = state.revision
+            events = []
+            if record is not None and state.event_id > self._newest_id:
+                events = record.events(self._newest_id)
+                self._newest_id = events[-1].event_id if events else self._newest_id
+            messages = [(event.event_id, _event_message(event)) for event in events]
+            self._tell(_state_message(state.model_dump_json()), messages)
+            # many viewers cost no more than a few: each is told less often
+            self._closing.wait(_LEAST_BETWEEN_STATES_S + self.viewers * _FOR_EACH_VIEWER_S)
 
     def _beat_if_due(self) -> None:
         """Tells how old the state is: a control loop that hangs is noticed on every screen."""
@@ -114,11 +124,20 @@ class Broadcast:
         assert self._server is not None
         self._told_s = time.monotonic()
         with contextlib.suppress(RuntimeError):  # the server's loop has ended
-            self._server.call_soon_threadsafe(self._publish, state, messages, beat)
+            self._server.call_soon_threadsafe(self._publish, self._folder, state, messages, beat)
 
     # In the server's event loop
 
-    def _publish(self, state: bytes | None, messages: list[tuple[int, bytes]], beat: bytes) -> None:
+    def _publish(
+        self,
+        folder: str | None,
+        state: bytes | None,
+        messages: list[tuple[int, bytes]],
+        beat: bytes,
+    ) -> None:
+        if folder != self._told_folder:  # nothing of one case is told in the next
+            self._told_folder = folder
+            self._events.clear()
         if state is not None:
             self._state_message = state
         self._beat_message = beat
@@ -131,7 +150,7 @@ class Broadcast:
         self.viewers += 1
         try:
             yield b"retry: 500\n\n"
-            reached_id = after_id
+            folder, reached_id = self._told_folder, after_id
             async for text, newest_id in self._missed(after_id):
                 reached_id = newest_id
                 yield text
@@ -140,6 +159,8 @@ class Broadcast:
             shown, beaten = self._state_message, self._beat_message
             while True:
                 turn = self._turn
+                if self._told_folder != folder:  # the numbers of another case begin anew
+                    folder, reached_id = self._told_folder, 0
                 if self._events and not self._keeps_all_since(reached_id):  # it dawdles
                     async for text, newest_id in self._missed(reached_id):
                         reached_id = newest_id
@@ -186,9 +207,10 @@ class Broadcast:
             yield text, after_id
 
     def _recorded(self, after_id: int) -> tuple[bytes, int]:
-        if not self._loop.state.case_uid:
+        folder = self._told_folder
+        if folder is None or not self._loop.state.case_uid:
             return b"", after_id
-        with CaseRecord(self._cases.required()) as record:
+        with CaseRecord(self._cases.folder_of(folder)) as record:
             events = record.events(after_id, _EVENTS_AT_ONCE)
         if not events:
             return b"", after_id

@@ -19,6 +19,16 @@ class Ask(_Body):
     by: str = Field(default="operator", min_length=1, max_length=64, description=_WHO)
 
 
+class ResetBody(Ask):
+    positions_um: dict[str, int] | None = Field(
+        default=None,
+        max_length=32,
+        description="Where the axes stand whose position is not certain, as somebody has seen: "
+        "what the state shows as robot.taken_um, or better.",
+        examples=[{"xt": 5000, "yt": -3000}],
+    )
+
+
 class PointBody(Ask):
     """A point in the patient, LPS mm."""
 
@@ -101,6 +111,22 @@ class CaseBody(Ask):
     label: str = Field(default="", max_length=200, examples=["Facet joint L4/5 left"])
     operator: str = Field(default="", max_length=200)
     note: str = Field(default="", max_length=2000)
+
+
+class CaseBegun(BaseModel):
+    """The name of the case's folder."""
+
+    folder: str
+
+
+class StudyBody(Ask):
+    study: str = Field(
+        min_length=1,
+        max_length=64,
+        pattern=r"^[0-9.]+$",
+        description="StudyInstanceUID of slices that /api/v1/holding lists.",
+        examples=["1.2.826.0.1.3680043.8.498.1"],
+    )
 
 
 class SettingsBody(Ask):

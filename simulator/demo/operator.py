@@ -117,7 +117,7 @@ class Operator:
         if not robot["linked"] or robot["moving"]:
             return True
         if robot["stopped"] or not robot["armed"] or not robot["position_certain"]:
-            self._order(self._client.reset)
+            self._order(self._client.reset, robot["taken_um"])
         elif state["question"] is not None:
             self._answer(state["question"])
         elif state["procedure"] is not None:

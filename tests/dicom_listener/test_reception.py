@@ -343,3 +343,17 @@ def test_whose_study_it_is_is_learnt_from_the_cases_where_nobody_kept_it(room):
     room.send("anna")
     assert states(record) == []
     assert room.why_held() == ["other_case"]
+
+
+def test_a_first_hold_that_missed_its_slice_does_not_hold_up_the_case(room):
+    """What was set aside there is known to the decisions to come, though no slice was used yet."""
+    record = room.begin(settled_s_ago=0)
+    room.send("anna")  # acquired before the hold had settled
+    record.expect_slices(1, 1)
+    time.sleep(0.01)
+    record.end_open_hold(time.time())
+    begin_hold(record, time.time() - 2, expected=100)
+    for _ in range(3):
+        room.send("anna")
+    assert room.why_held() == []
+    assert states(record)[-1] == "assigned"

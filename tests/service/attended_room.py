@@ -96,7 +96,7 @@ def arm(client: RoomClient) -> None:
     """Link, arm, and wait until the state says so."""
     state = wait_for(client.state, lambda s: s.robot.linked and not s.robot.moving)
     if state.robot.stopped or not state.robot.armed or not state.robot.position_certain:
-        client.reset()
+        client.reset(state.robot.taken_um)
     wait_for(client.state, lambda s: s.robot.armed and not s.robot.stopped)
 
 

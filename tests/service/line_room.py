@@ -154,7 +154,7 @@ class LineRoom:
         state = self.until(lambda s: s.robot.linked and not s.robot.moving)
         robot = state.robot
         if robot.stopped or not robot.armed or not robot.position_certain:
-            self.call("reset")
+            self.call("reset", positions_um=robot.taken_um)
         return self.until(lambda s: s.robot.armed and not s.robot.stopped)
 
     def run_to_end(self, answer: Callable[[RoomState], str] | None = None) -> RoomState:

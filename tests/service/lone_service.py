@@ -34,14 +34,16 @@ def running_service(folder: Path, more: str = "") -> Iterator[str]:
 
 
 @contextmanager
-def ready_service(folder: Path, more: str = "") -> Iterator[dict[str, str]]:
+def ready_service(
+    folder: Path, more: str = "", *, config: str = CONFIG
+) -> Iterator[dict[str, str]]:
     """What such a service says when it is ready."""
-    config = folder / "room.toml"
-    config.write_text(CONFIG + more)
+    file = folder / "room.toml"
+    file.write_text(config + more)
     log = folder / "service.log"
     with log.open("wb") as errors:
         process = subprocess.Popen(
-            [*autospine("service", "--config", str(config)), "--exit-with-parent"],
+            [*autospine("service", "--config", str(file)), "--exit-with-parent"],
             stdin=subprocess.PIPE,
             stdout=subprocess.PIPE,
             stderr=errors,

@@ -7,6 +7,7 @@ import pytest
 from offline_arguments import GATE, calibration_arguments
 
 from service.procedure.calibration import calibrate
+from service.procedure.jacobian import CalibrationError
 from service.procedure.sensing import ProcedureFailedError, move
 from service.procedure.steps import MoveTo
 from service.procedure.strategies import STRATEGIES, look_at_fiducial
@@ -122,3 +123,47 @@ def test_the_native_jacobian_scaled_is_the_one_of_super_resolution_images(calibr
     native_px_per_mm = calibration.jacobian.columns[:, (0, 2)] / 1.0
     # a circle in an SR image errs by about 0.2 of its pixels, a move by 1 %
     assert sr_px_per_mm == pytest.approx(2 * native_px_per_mm, abs=0.06)
+
+
+@pytest.mark.parametrize("stop_um", [13_000, 11_000, 5_000])
+def test_a_drive_into_the_hard_stop_is_no_calibration(make_room, stop_um):
+    """The stages stand 10 mm and more beyond where they were said to: the way out is cut short."""
+    room = make_room(seed=1, stages=StageParameters(travel_um=(-30_000.0, float(stop_um))))
+    with pytest.raises(ProcedureFailedError) as failed:
+        room.run(calibrate(calibration_arguments()))
+    assert failed.value.code in ("calibration", "prediction_missed")
+
+
+def calibrated_jacobian(make_room, seed, **stages):
+    room = make_room(seed=seed, stages=StageParameters(**stages))
+    return room.run(calibrate(calibration_arguments())).jacobian
+
+
+@pytest.mark.parametrize("same_mount", [True, False])
+def test_a_calibration_like_the_last_one_of_this_robot_is_taken(make_room, same_mount):
+    last = calibrated_jacobian(make_room, 1).to_json()
+    for seed in range(2, 8):
+        again = calibration_arguments(last=last, same_mount=same_mount)
+        make_room(seed=seed).run(calibrate(again))
+
+
+@pytest.mark.parametrize("same_mount", [True, False])
+def test_a_calibration_unlike_the_last_one_of_this_robot_is_refused(make_room, same_mount):
+    last = calibrated_jacobian(make_room, 1).to_json()
+    other = make_room(seed=2)
+    other.nominal_step_um = dict.fromkeys(other.nominal_step_um, 4.5 / 0.8)
+    with pytest.raises(ProcedureFailedError, match="otherwise than at the last calibration"):
+        other.run(calibrate(calibration_arguments(last=last, same_mount=same_mount)))
+
+
+def test_a_robot_that_was_mounted_anew_may_be_turned_and_no_longer_than_before(make_room):
+    jacobian = calibrated_jacobian(make_room, 1)
+    turn = np.deg2rad(25)
+    turned = replace(
+        jacobian,
+        columns=np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])
+        @ jacobian.columns,
+    )
+    turned.check_is_of_same_robot(jacobian, 0.015, same_mount=False)
+    with pytest.raises(CalibrationError, match="otherwise than at the last calibration"):
+        turned.check_is_of_same_robot(jacobian, 0.015, same_mount=True)

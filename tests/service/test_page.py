@@ -29,7 +29,7 @@ def ready_to_calibrate(page: Page, client: RoomClient) -> None:
     if state.ready:
         client.needle_out()
     if not client.state().robot.armed or client.state().robot.stopped:
-        page.get_by_role("button", name=re.compile("^(Arm|Re-arm) the robot$")).click(
+        page.get_by_role("button", name=re.compile("(arm|Arm|Re-arm|re-arm) the robot$")).click(
             timeout=SLOW_MS
         )
     expect(page.locator("#chips")).to_contain_text("Armed", timeout=SLOW_MS)

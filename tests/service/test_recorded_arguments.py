@@ -47,7 +47,7 @@ RECORDED = {
     ),
 }
 OTHERS = {
-    CALIBRATION: CALIBRATED | {"shifts_px", "method"},
+    CALIBRATION: CALIBRATED | {"shifts_px", "method", "last", "same_mount"},
     APPROACH: APPROACHED
     | {"confirm_moves", "most_frames", "proven", "strategy", "stop_rule", "seed"},
     GUIDE_CALIBRATION: CALIBRATED | {"geometry"},

@@ -9,6 +9,8 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from typing import Any
 
+from service.room.cases.life import CaseLife
+from service.room.commands.case import CaseCommands
 from service.room.commands.procedure import ProcedureCommands
 from service.room.commands.proposals import ProposalCommands
 from service.room.commands.record import RecordCommands
@@ -22,13 +24,16 @@ from service.room.ready_keeper import keep_ready
 class Commands:
     """Everything that may be asked, by name."""
 
-    def __init__(self, room: Room) -> None:
+    def __init__(self, room: Room, life: CaseLife) -> None:
         self._room = room
+        self._case = CaseCommands(room, life)
         self._proposals = ProposalCommands(room, TargetCommands(room))
-        self._by_name = {one.__name__: one for one in _all_of(room, self._proposals)}
+        all_of_case = (*_all_of(room, life, self._proposals), *self._case.all())
+        self._by_name = {one.__name__: one for one in all_of_case}
 
     def carry_out(self, name: str, arguments: Mapping[str, Any]) -> Any:
         """Carry out a command; raises ConflictError if it cannot be done now."""
+        self._case.check(name)
         return self._by_name[name](**arguments)
 
     def keep_ready(self) -> None:
@@ -40,9 +45,15 @@ class Commands:
         self._proposals.look_for_plans()
 
 
-def _all_of(room: Room, proposals: ProposalCommands) -> tuple[Callable[..., Any], ...]:
+def _all_of(
+    room: Room, life: CaseLife, proposals: ProposalCommands
+) -> tuple[Callable[..., Any], ...]:
     robot = RobotCommands(room)
-    target, procedure, record = TargetCommands(room), ProcedureCommands(room), RecordCommands(room)
+    target, procedure, record = (
+        TargetCommands(room),
+        ProcedureCommands(room, life.cases),
+        RecordCommands(room),
+    )
     return (
         robot.reset,
         robot.note_stop,

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Any
 
+from case_record.cases import Cases
 from room_config.service import GuideConfig
 from service.procedure.fiducial_plan import approach_of, calibration_of
 from service.procedure.guide_plan import guide_approach_of, guide_calibration_of
@@ -33,13 +35,15 @@ from service.room.context import Room
 from service.room.history import arrival_by_hand
 from service.room.present import PUNCTURE, readiness
 from service.room.readiness import ConflictError
+from service.room.robot.memory import last_jacobian
 
 
 class ProcedureCommands:
     """Calibration, approach and puncture."""
 
-    def __init__(self, room: Room) -> None:
+    def __init__(self, room: Room, cases: Cases) -> None:
         self._room = room
+        self._cases = cases
 
     def start_calibration(self, by: str, guide: bool | None = None) -> int:
         """Begin a calibration; returns its procedure id. guide: four axes; None: as configured."""
@@ -51,6 +55,8 @@ class ProcedureCommands:
             arguments = calibration_of(self._room.config, self._room.travel(), self._room.seed())
         except PlanRefusedError as error:
             raise ConflictError("out_of_travel", f"Calibration: {error}.") from error
+        last, same_mount = last_jacobian(self._room.record, self._cases)
+        arguments = replace(arguments, last=last, same_mount=same_mount)
         return self._room.begin(CALIBRATION, calibration_arguments(arguments), by)
 
     def _start_guide_calibration(self, guide: GuideConfig, by: str) -> int:

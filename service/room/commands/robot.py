@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from robot_bridge.client.client import BridgeError, BridgeStatus
 from service.procedure.plan import PlanRefusedError, check_travel
 from service.procedure.registry import JOG
-from service.procedure.start_point import POSITION_DECLARED, positions_to_declare
+from service.procedure.start_point import POSITION_DECLARED
 from service.room.context import Room
 from service.room.present import NEEDLE_OUT
 from service.room.readiness import ConflictError
+from service.room.robot.whereabouts import in_words, taken_to_stand
 
 
 class RobotCommands:
@@ -17,13 +20,17 @@ class RobotCommands:
     def __init__(self, room: Room) -> None:
         self._room = room
 
-    def reset(self, by: str) -> None:
-        """Clear a latched stop, take the positions as they stand or are recorded, and arm."""
+    def reset(self, by: str, positions_um: Mapping[str, int] | None = None) -> None:
+        """Clear a latched stop, and arm.
+
+        positions_um: where the operator says that the axes stand whose position is not certain.
+        Nobody else says so: without it a robot that may stand anywhere is not armed.
+        """
         status = self._room.linked()
         pressed = self._room.stops.pressed
         try:
             if not status.position_certain:
-                self._declare_where_it_is_taken_to_stand(status, by)
+                self._declare(status, by, positions_um)
             if status.stopped:
                 self._room.link.client.rearm(by)
             elif not status.armed:
@@ -33,21 +40,25 @@ class RobotCommands:
         self._room.stops.release(pressed)
         self._room.note("armed", by, {})
 
-    def _declare_where_it_is_taken_to_stand(self, status: BridgeStatus, by: str) -> None:
-        """Each axis that is not certain: by the bridge's own memory, with its bound, if it has one.
-
-        Raises BridgeError.
+    def _declare(self, status: BridgeStatus, by: str, said_um: Mapping[str, int] | None) -> None:
+        """What the operator said of the axes that are not certain; where that is only what the
+        bridge remembers, it is known no better than that. Raises BridgeError.
         """
-        counted_um = {
-            axis: at_um
-            for axis, at_um in status.positions_um.items()
-            if axis not in status.certain_axes
+        taken = taken_to_stand(status)
+        if said_um is None or said_um.keys() != taken.keys():
+            raise ConflictError(
+                "position_unconfirmed",
+                f"{in_words(taken)} Nothing is armed until somebody says that they stand there "
+                "(positions_um), or where they stand.",
+            )
+        counted_um = {axis: status.positions_um.get(axis, 0) for axis in taken}
+        within_um = {
+            axis: one.within_um
+            for axis, one in taken.items()
+            if one.within_um is not None and said_um[axis] == one.at_um
         }
-        positions_um = positions_to_declare(self._room.record, counted_um)
-        positions_um |= status.remembered_um
-        within_um = {axis: status.bound_um[axis] for axis in status.remembered_um}
-        self._room.link.client.declare_position(positions_um, by, within_um)
-        body = {"positions_um": positions_um, "counted_um": counted_um, "within_um": within_um}
+        self._room.link.client.declare_position(dict(said_um), by, within_um)
+        body = {"positions_um": dict(said_um), "counted_um": counted_um, "within_um": within_um}
         self._room.note(POSITION_DECLARED, by, body)
 
     def note_stop(self, by: str, emergency: bool) -> None:

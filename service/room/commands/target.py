@@ -14,8 +14,9 @@ from service.procedure.targets import (
     ENTRY_SET,
     TARGET_SET,
     TARGET_WITHDRAWN,
-    all_targets,
+    TargetError,
     current_target,
+    target_that_can_be_taken,
 )
 from service.room.context import Room
 from service.room.proposals import Plan, why_not_in_bore, why_senseless
@@ -71,9 +72,10 @@ class TargetCommands:
 
     def choose_target(self, number: int, by: str) -> None:
         """Take a target of this case again, by its number."""
-        known = next((t for t in all_targets(self._room.record) if t.number == number), None)
-        if known is None:
-            raise ConflictError("no_target", f"This case has no target number {number}.")
+        try:
+            known = target_that_can_be_taken(self._room.record, number)
+        except TargetError as error:
+            raise ConflictError("no_target", f"Not taken: {error}.") from error
         self._void_plan_for(by, "target was changed")
         body: dict[str, Any] = {"patient_mm": list(known.patient_mm), "label": known.label}
         if known.frame is not None:  # it is where it was set, not where it is chosen again

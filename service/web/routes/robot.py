@@ -11,7 +11,7 @@ from fastapi.responses import HTMLResponse, JSONResponse
 from service.room.control import ControlLoop
 from service.web.orders import REFUSALS, Caller, Key, Orders, who
 from service.web.problems import responses
-from service.web.schemas import Ask, JogBody, Started, StopAnswer, StopBody
+from service.web.schemas import JogBody, ResetBody, Started, StopAnswer, StopBody
 
 STOP_WORDS = {
     "stopped": "Stopped.",
@@ -89,10 +89,12 @@ def robot_router(orders: Orders) -> APIRouter:
     router = APIRouter(prefix="/api/v1", tags=["robot"], responses=REFUSALS)
 
     @router.post("/reset", status_code=204)
-    def reset(body: Ask, caller: Caller, key: Key = None) -> None:
-        """Clear a latched stop, take the positions as they stand, and arm.
+    def reset(body: ResetBody, caller: Caller, key: Key = None) -> None:
+        """Clear a latched stop, and arm.
 
-        Controllers that count from zero again are taken to stand where they were last recorded.
+        Where the robot's position is not certain (a bridge or controllers that were restarted), it
+        is refused until `positions_um` says where the stages stand; the refusal, and robot.taken_um
+        in the state, say where they are taken to stand, and from what.
         """
         orders.carry_out(caller, key, "reset", body)
 

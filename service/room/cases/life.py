@@ -1,0 +1,123 @@
+"""How a case begins, ends, and is found again at a start.
+
+A case is begun and finished by a person; a crash in between changes nothing, the next start goes on
+with it. One that was left open on another day is asked about first: the patient on the table may be
+another one.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from datetime import datetime
+from pathlib import Path
+
+from case_record.cases import Cases
+from case_record.record import CaseRecord, CaseRecordError
+from case_record.rows import Event
+from service.procedure.scan_frame import CASE_REOPENED
+
+FINISHED, REOPENED, CONTINUED = "case_finished", CASE_REOPENED, "case_continued"
+DESCRIBED = "case_described"
+CLOCK_COMPARED, CLOCK_FORGOTTEN = "clock_sync", "clock_reset"
+QUESTION = (
+    "This case was left open on another day. Is it the patient on the table? Go on with it, or "
+    "finish it."
+)
+_SOURCE = "service"
+# who went on with a case past midnight is not asked after a crash in the middle of it
+_LATELY_S = 3600.0
+_LOOKED_AT = 200
+
+
+class CaseLife:
+    """Of the open case, for as long as this service works on it. `asks`: go on with it at all?"""
+
+    def __init__(self, cases: Cases, record: CaseRecord, now_s: float) -> None:
+        self.cases = cases
+        self.asks = cases.only is None and is_of_another_day(record, now_s)
+
+
+def is_finished(record: CaseRecord) -> bool:
+    """Whether it was finished, and not opened again since."""
+    finished, reopened = record.last_event(FINISHED), record.last_event(REOPENED)
+    return finished is not None and (reopened is None or reopened.seq < finished.seq)
+
+
+def is_of_another_day(record: CaseRecord, now_s: float) -> bool:
+    """Whether the last thing that anybody did in this case was on another day, not just now."""
+    last = _last_deed(record)
+    if last is None:
+        return False
+    same_day = datetime.fromtimestamp(last.wall_s).date() == datetime.fromtimestamp(now_s).date()
+    return not same_day and not 0 <= now_s - last.wall_s < _LATELY_S
+
+
+def _last_deed(record: CaseRecord) -> Event | None:
+    """The newest event that does not come by itself (slices do, also when nobody is there)."""
+    before = None
+    while batch := record.newest_events(_LOOKED_AT, before):
+        for event in batch:
+            if event.source in ("record", "operator") or event.source == _SOURCE:
+                return event
+        before = batch[-1].event_id
+    return None
+
+
+def set_at_rest(record: CaseRecord) -> None:
+    """Nothing that was under way in a case of another day goes on: end procedure and hold."""
+    running = record.running_procedure()
+    with record.transaction():
+        record.end_open_hold(time.time())
+        if running is None:
+            return
+        reason = "the room was started on another day"
+        record.end_procedure(running.procedure_id, "aborted", {"reason": reason})
+        body = {"procedure_id": running.procedure_id, "name": running.name, "reason": reason}
+        record.append_event("procedure_aborted", body, source="record")
+
+
+def begin(cases: Cases, room: str, by: str, words: Mapping[str, str]) -> Path:
+    """Begin a case and open it; return its folder. CaseRecordError where that cannot be.
+
+    What is known of the scanner's clock is the room's, not the case's: it comes along.
+    """
+    compared = _comparison(cases)
+    folder = cases.make_folder()
+    with CaseRecord(folder, create=True) as record, record.transaction():
+        record.start_case(room, seed=0)
+        record.append_event(DESCRIBED, dict(words), source=_SOURCE, who=by)
+        if compared is not None:
+            record.append_event(
+                CLOCK_COMPARED, dict(compared.body), source=_SOURCE, who=compared.who
+            )
+    cases.set_open(folder)
+    return folder
+
+
+def _comparison(cases: Cases) -> Event | None:
+    """The last comparison of the clocks in the last case, unless it was forgotten since."""
+    folders = cases.folders()
+    if not folders:
+        return None
+    try:
+        with CaseRecord(folders[-1], read_only=True) as record:
+            compared = record.last_event(CLOCK_COMPARED)
+            forgotten = record.last_event(CLOCK_FORGOTTEN)
+    except CaseRecordError:
+        return None
+    if compared is None or (forgotten is not None and forgotten.seq > compared.seq):
+        return None
+    return compared
+
+
+def reopen(cases: Cases, name: str, by: str) -> Path:
+    """Open a finished case again; CaseRecordError where there is none, or it cannot be written.
+
+    Where the robot stands, and what it is calibrated to, is as good as unknown then.
+    """
+    folder = cases.named(name)
+    with CaseRecord(folder) as record:
+        record.append_event(REOPENED, {}, source=_SOURCE, who=by)
+    cases.set_open(folder)
+    return folder

@@ -1,0 +1,256 @@
+"""A day in the room: one patient after the other by clicking, and nothing is ever restarted for it.
+
+One is interrupted by `kill -9` of the service; before another the controllers lose their supply.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import re
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import pydicom
+import pytest
+from attended_room import AttendedRoom, wait_for
+from browser import laid_out
+from playwright.sync_api import Browser, Page, expect
+from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
+
+from case_record.cases import Cases
+from case_record.record import CaseRecord
+from service.client import RoomClient, ServiceGoneError
+from service.room.state import RoomState
+
+pytestmark = pytest.mark.timeout(1800)
+SLOW_MS = 120_000
+
+
+class Hospital(AttendedRoom):
+    """The virtual room with a folder of cases, whose controllers can lose their supply."""
+
+    def _write_config(self, ports: tuple[int, int]) -> Path:
+        path = super()._write_config(ports)
+        one = f'case_dir = "{self.folder}"'
+        text = path.read_text()
+        assert one in text
+        path.write_text(text.replace(one, f'cases_dir = "{self.folder / "cases"}"'))
+        return path
+
+    def power_cycle_controllers(self) -> None:
+        """They count from zero again; the stages stand where they stood."""
+        self.kill("bridge")
+        self.kill("motors")
+        self.family.children["motors"].end()
+        self.family.start("motors", [*self._motors_words(), "--truth-port", str(self.truth_port)])
+        self.start_bridge_again()
+
+
+@pytest.fixture
+def hospital(tmp_path: Path) -> Iterator[Hospital]:
+    room = Hospital(tmp_path)
+    try:
+        room.start()
+        yield room
+    finally:
+        room.end()
+
+
+@pytest.fixture
+def screen(browser: Browser, hospital: Hospital) -> Iterator[Page]:
+    page = browser.new_page(viewport={"width": 1280, "height": 900})
+    page.set_default_timeout(SLOW_MS)
+    page.goto(hospital.url)
+    yield page
+    page.close()
+
+
+def press(page: Page, words: str | re.Pattern[str]) -> None:
+    page.get_by_role("button", name=words, exact=isinstance(words, str)).first.click()
+
+
+def state_of(client: RoomClient) -> RoomState | None:
+    """None while the service is being started again."""
+    try:
+        return client.state()
+    except ServiceGoneError:
+        return None
+
+
+def until(client: RoomClient, wanted, timeout_s: float = 180.0) -> RoomState:
+    return wait_for(lambda: state_of(client), lambda s: s is not None and wanted(s), timeout_s)
+
+
+def arm(page: Page, client: RoomClient) -> None:
+    """Arm the robot, as the page asks for it; a question that is open comes first."""
+    offered = page.get_by_role("button", name=re.compile("(arm|Arm) the robot$")).first
+    while True:
+        state = until(client, lambda s: s.robot.linked and not s.robot.moving)
+        robot = state.robot
+        if (robot.armed and not robot.stopped and robot.position_certain) or state.question:
+            return
+        if robot.taken_um:
+            expect(page.locator("#next")).to_contain_text("are taken to stand at")
+        with contextlib.suppress(PlaywrightTimeoutError):  # the page was drawn anew meanwhile
+            offered.click(timeout=2000)
+        page.wait_for_timeout(200)
+
+
+def go_through(page: Page, client: RoomClient, done) -> RoomState:
+    """Click the main answer of whatever is asked until `done`."""
+    while True:
+        state = until(client, lambda s: done(s) or s.question is not None or not s.robot.armed)
+        if done(state):
+            return state
+        if state.question is None:
+            arm(page, client)
+            continue
+        with contextlib.suppress(PlaywrightTimeoutError):  # it was answered by what happened
+            page.locator("#question .answers button.main").click(timeout=5000)
+
+
+def begin(page: Page, client: RoomClient, label: str) -> str:
+    expect(page.locator("#new-label")).to_be_visible()
+    page.locator("#new-label").fill(label)
+    press(page, "Begin the case")
+    state = until(client, lambda s: s.case_folder and s.case and s.case.label == label)
+    expect(page.locator("#room")).to_contain_text(label)
+    assert state.calibrated is False
+    assert state.target_patient_mm is None
+    assert state.measurement is None
+    assert state.slices == {}
+    assert state.case_folder is not None
+    return state.case_folder
+
+
+def calibrate(page: Page, client: RoomClient) -> None:
+    press(page, "Start the calibration")
+    until(client, lambda s: s.procedure == "calibration" or s.question is not None)
+    go_through(page, client, lambda s: s.procedure is None and s.calibrated)
+
+
+def pick_and_approach(page: Page, client: RoomClient) -> None:
+    state = client.state()
+    assert state.slice is not None
+    assert state.measurement is not None
+    assert state.measurement.centre_px is not None
+    row, col = state.measurement.centre_px
+    press(page, "Pick target")
+    laid_out(page)
+    box = page.locator(".view canvas").first.bounding_box()
+    assert box is not None
+    rows, cols = state.slice.shape
+    x = box["x"] + (col + 2.5) * box["width"] / cols
+    page.mouse.click(x, box["y"] + (row - 1.5) * box["height"] / rows)
+    press(page, "Set target")
+    until(client, lambda s: s.target_patient_mm is not None)
+    press(page, "Start the approach")
+    until(client, lambda s: s.procedure == "approach" or s.ready)
+    go_through(page, client, lambda s: s.ready and s.robot.insertion_locked)
+
+
+def puncture(page: Page, client: RoomClient) -> None:
+    press(page, "Record the puncture")
+    press(page, "Record the puncture")
+    until(client, lambda s: s.punctured)
+    unlock = page.get_by_role("button", name=re.compile("unlock", re.I)).first
+    unlock.click()
+    while client.state().robot.insertion_locked:
+        again = page.get_by_role("button", name=re.compile("unlock", re.I)).first
+        if again.is_visible() and again.is_enabled():
+            again.click()
+        page.wait_for_timeout(100)
+
+
+def finish(page: Page, client: RoomClient) -> None:
+    press(page, "Finish the case …")
+    press(page, "Finish the case now")
+    until(client, lambda s: s.case_folder is None)
+    expect(page.locator("#new-label")).to_be_visible()
+
+
+def one_patient(
+    page: Page, client: RoomClient, hospital: Hospital, label: str, *, killed: bool
+) -> str:
+    folder = begin(page, client, label)
+    arm(page, client)
+    if killed:
+        press(page, "Start the calibration")
+        until(client, lambda s: s.robot.moving)
+        hospital.kill("service")
+        hospital.start_again("service")
+        state = until(client, lambda s: s.robot.linked)
+        assert state.case_folder == folder
+        assert state.case_question == ""
+        expect(page.locator("#room")).to_contain_text(label)
+        go_through(page, client, lambda s: s.procedure is None)
+        arm(page, client)
+    if not client.state().calibrated:
+        calibrate(page, client)
+    pick_and_approach(page, client)
+    puncture(page, client)
+    finish(page, client)
+    return folder
+
+
+def identity_of(folder: Path) -> set[str]:
+    """Whatever names a patient or an examination in the slices of a case."""
+    found: set[str] = set()
+    for path in (folder / "inbox").glob("*.dcm"):
+        data_set = pydicom.dcmread(path, stop_before_pixels=True)
+        found |= {str(data_set.PatientID), str(data_set.PatientName)}
+        found |= {str(data_set.StudyInstanceUID), str(data_set.FrameOfReferenceUID)}
+        found.add(str(data_set.SOPInstanceUID))
+    return found
+
+
+def said_in(folder: Path, words: set[str]) -> list[str]:
+    """Files of a case, and members of its export, that say one of the words."""
+    wanted = [word.encode() for word in words]
+    said = []
+    for path in folder.rglob("*"):
+        if not path.is_file():
+            continue
+        pieces = {str(path): path.read_bytes()}
+        if path.suffix == ".zip":
+            with zipfile.ZipFile(io.BytesIO(pieces[str(path)])) as archive:
+                pieces = {name: archive.read(name) for name in archive.namelist()}
+        said += [name for name, text in pieces.items() if any(word in text for word in wanted)]
+    return said
+
+
+@pytest.mark.parametrize(
+    ("patients", "killed", "cycled"),
+    [
+        pytest.param(2, 1, 2, id="two"),
+        pytest.param(5, 3, 4, id="five", marks=pytest.mark.soak),
+    ],
+)
+def test_patients_one_after_the_other_by_clicking(hospital, screen, patients, killed, cycled):
+    cases = Cases(hospital.folder / "cases")
+    with RoomClient(hospital.url, by="tester") as client:
+        folders = []
+        for number in range(1, patients + 1):
+            if number == cycled:
+                hospital.power_cycle_controllers()
+                until(client, lambda s: s.robot.linked and s.robot.taken_um)
+            folders.append(
+                one_patient(screen, client, hospital, f"patient {number}", killed=number == killed)
+            )
+        papers = [cases.home / name / "papers" / "case.zip" for name in folders]
+        wait_for(lambda: [path.is_file() for path in papers], all, 120.0)
+        of_case = {name: str(client.events(case=name)) for name in folders}
+    identities = {name: identity_of(cases.home / name) for name in folders}
+    for name in folders:
+        with CaseRecord(cases.home / name, read_only=True) as record:
+            record.verify_events()
+            assert record.last_event("puncture") is not None
+            assert record.last_event("case_finished") is not None
+            assert all(move.measurement_id is None or move.state for move in record.moves())
+        for other in set(folders) - {name}:
+            strangers = identities[other] - identities[name]
+            assert strangers, "each patient is another one"
+            assert said_in(cases.home / name, strangers) == []
+            assert not any(word in of_case[name] for word in strangers)
