@@ -24,3 +24,9 @@ def test_the_house_is_in_order(name):
         [BIN / program, *words], cwd=ROOT, capture_output=True, text=True, check=False
     )
     assert result.returncode == 0, result.stdout + result.stderr
+
+
+def test_no_mark_of_an_unfinished_merge_is_left():
+    words = ["git", "grep", "-nE", "^(<{7}|>{7}) ", "--", "."]
+    found = subprocess.run(words, cwd=ROOT, capture_output=True, text=True, check=False)
+    assert found.stdout == ""
