@@ -20,7 +20,6 @@ from dicom_slice.times import AcquisitionInterval
 
 _LAGS_KEPT = 10
 _MUCH_SOONER_S = 0.5
-_MANY_TIMES = 10
 _LAGS_THAT_SHOW_A_HABIT = 5
 
 
@@ -41,7 +40,8 @@ class ClockRules:
     do not come equally late.
     longest_acquisition_s: no acquisition that comes without its duration lasts longer.
     late_limit_s: a slice that seems to come later than this shows a clock that was set back, or a
-    network that stood still, and nothing can tell which.
+    network that stood still, and nothing can tell which. So long after the clock was set a slice
+    may have been acquired before, however promptly slices come here: one may be held up.
     comparison_valid_s: a comparison says nothing of a slice further away in time than this, unless
     the scanner says that its clock is synchronized (AcquisitionTimeSynchronized).
     drift_ppm: what a clock may run off by while its time service slews it (ntpd: 500 ppm).
@@ -58,13 +58,6 @@ class ClockRules:
     drift_ppm: float = 500.0
     synchronized_drift_ppm: float = 50.0
     drift_alarm_s: float = 1.0
-
-    @property
-    def on_the_way_s(self) -> float:
-        """A slice received so long after the clock was set may have been acquired before."""
-        if self.promptness is None:
-            return self.late_limit_s
-        return min(self.late_limit_s, _MANY_TIMES * self.promptness.most_s)
 
 
 @dataclass(frozen=True)
@@ -158,7 +151,7 @@ class ScannerClock:
         against = self.contradicted or self.suspicion
         if against:
             return OffsetUnknown(f"{against}: {_WHAT_TO_DO}")
-        if self.set_at_s is not None and slice_.received_s < self.set_at_s + rules.on_the_way_s:
+        if self.set_at_s is not None and slice_.received_s < self.set_at_s + rules.late_limit_s:
             return OffsetUnknown(
                 "it may have been acquired before the scanner's clock was set: scan again, or "
                 "confirm at which hold this acquisition was made"

@@ -195,6 +195,8 @@ class DemoRoom:
                 "clock_uncertainty_s": 0.02,
                 # the virtual scanner reconstructs in 0.15 s and sends at once
                 "prompt_delay_s": 0.3,
+                # nor does it hold a slice back for longer than the fault `late` does
+                "late_limit_s": 8.0,
             },
             "service": {
                 "port": page_port,
