@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeVar
@@ -15,9 +15,10 @@ from room_config.shell import autospine
 from service.client import RoomClient, ServiceGoneError
 from service.room.state import RoomState
 from simulator.demo.room import DemoOptions, DemoRoom
-from simulator.truth_client import TruthAddress, ask_path
+from simulator.truth_client import TruthAddress, ask_path, ask_where
 
 Seen = TypeVar("Seen")
+_TRUTH_PORTS: dict[str, int] = {}  # by the address of the service
 
 
 class AttendedRoom(DemoRoom):
@@ -38,6 +39,10 @@ class AttendedRoom(DemoRoom):
         text = path.read_text().replace("confirm_moves = false", "confirm_moves = true")
         path.write_text(text + self._more)
         return path
+
+    def start(self) -> None:
+        super().start()
+        _TRUTH_PORTS[self.url] = self.truth_port
 
     def kill(self, name: str) -> None:
         """As `kill -9` does."""
@@ -92,11 +97,20 @@ def wait_for(
         time.sleep(0.02)
 
 
+def read_off(client: RoomClient, axes: Iterable[str]) -> dict[str, int]:
+    """Where a person reads on the stages' scales that these axes stand, µm."""
+    truth = ask_where(TruthAddress("127.0.0.1", _TRUTH_PORTS[client.url]))
+    return {axis: round(1000 * truth.positions_mm[axis]) for axis in axes}
+
+
 def arm(client: RoomClient) -> None:
-    """Link, arm, and wait until the state says so."""
+    """Link, arm, and wait until the state says so.
+
+    Where an interrupted motion left an axis is read off its scale: a guess would narrow its travel.
+    """
     state = wait_for(client.state, lambda s: s.robot.linked and not s.robot.moving)
     if state.robot.stopped or not state.robot.armed or not state.robot.position_certain:
-        client.reset(state.robot.taken_um)
+        client.reset(read_off(client, state.robot.taken_um))
     wait_for(client.state, lambda s: s.robot.armed and not s.robot.stopped)
 
 

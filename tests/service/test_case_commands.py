@@ -14,6 +14,7 @@ import pytest
 from offline_arguments import approach_arguments, beside, calibration_arguments
 
 from case_record.record import FILE_NAME, CaseRecord
+from case_record.sealing import prepare
 from service.cli.replay import replay_measurements
 from service.procedure.registry import (
     APPROACH,
@@ -97,6 +98,7 @@ def test_a_procedure_that_would_now_take_other_steps_is_told(case, tmp_path):
     copy = tmp_path / "copy"
     shutil.copytree(case, copy)
     db = sqlite3.connect(copy / FILE_NAME)
+    prepare(db)  # as by a program that seals what it writes
     body = json.loads(
         db.execute("SELECT body FROM step WHERE procedure_id = 2 AND kind = 'MoveTo'").fetchone()[0]
     )

@@ -355,7 +355,7 @@ def test_the_loss_of_the_service_greys_the_page_at_once_and_its_return_revives_i
     expect(page.locator("body")).to_have_class("stale", timeout=SLOW_MS)
     expect(page.locator("#banner-lost")).to_contain_text("Connection lost")
     page.locator("#stop").click()
-    expect(page.locator("#refusal")).to_contain_text("stop switch at the robot")
+    expect(page.locator("#stop-said")).to_contain_text("NOT DELIVERED")
     room.start_again("service")
     expect(page.locator("body")).not_to_have_class("stale", timeout=SLOW_MS)
     expect(page.locator("#banner-lost")).to_be_hidden()
