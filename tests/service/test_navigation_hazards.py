@@ -13,6 +13,7 @@ import pytest
 from offline_arguments import approach_arguments, beside, calibration_arguments
 
 from case_record.record import CaseRecord
+from case_record.sealing import prepare
 from service.procedure.approach import approach
 from service.procedure.calibration import calibrate
 from service.procedure.plan import PLAN_VOID, why_void
@@ -206,6 +207,7 @@ def test_a_step_recorded_before_a_field_was_known_is_still_the_same_step(recorde
     with pytest.raises(Killed):
         run_until(recorded, number, steps=3)
     db = sqlite3.connect(recorded.record.case_dir / "case.sqlite")
+    prepare(db)
     for step_number, body in db.execute("SELECT number, body FROM step").fetchall():
         older = json.loads(body)
         for name in ("from_um", "fresh", "slice_position_mm", "shift_sigma_mm"):
