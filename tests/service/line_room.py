@@ -12,7 +12,7 @@ import queue
 import sys
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
@@ -150,11 +150,16 @@ class LineRoom:
     def stop(self, *, emergency: bool = False) -> None:
         self.do(lambda: self.loop.stop_answered(self.loop.stop("tester", emergency=emergency)))
 
+    def read_off(self, axes: Iterable[str]) -> dict[str, int]:
+        """Where a person reads on the stages' scales that these axes stand, µm."""
+        at_um = self.line.stage.positions_um()
+        return {axis: round(at_um[axis]) for axis in axes}
+
     def arm(self) -> RoomState:
         state = self.until(lambda s: s.robot.linked and not s.robot.moving)
         robot = state.robot
         if robot.stopped or not robot.armed or not robot.position_certain:
-            self.call("reset", positions_um=robot.taken_um)
+            self.call("reset", positions_um=self.read_off(robot.taken_um))
         return self.until(lambda s: s.robot.armed and not s.robot.stopped)
 
     def run_to_end(self, answer: Callable[[RoomState], str] | None = None) -> RoomState:

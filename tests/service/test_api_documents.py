@@ -169,6 +169,6 @@ def test_a_case_that_cannot_be_read_is_a_problem_in_the_words_of_the_command(
         broken.commit()
     with running_service(tmp_path) as url, RoomClient(url) as client:
         for make in (client.report, client.export):
-            with pytest.raises(RefusedByServiceError, match="chain is broken at event 2") as told:
+            with pytest.raises(RefusedByServiceError, match="event 2 was changed") as told:
                 make("broken")
             assert told.value.status == 409

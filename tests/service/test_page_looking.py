@@ -278,7 +278,6 @@ def test_slices_that_will_not_come_are_given_up_where_slices_were_set_aside(
     )
     assert given_up[-1].who == "operator"
     assert given_up[-1].body["hold_id"] == slice_.hold_id
-    client.assign_slice(slice_.slice_id, slice_.hold_id, why="it was right")
 
 
 def test_report_and_export_of_this_case_and_of_others_are_a_click_away(

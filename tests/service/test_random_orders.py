@@ -122,7 +122,10 @@ class Monkey:
 
     def go_to_ready(self) -> None:
         """What a sensible operator does, lest the room never comes to READY."""
-        if not self.order("reset") and self.room.state.robot.insertion_locked:
+        if (
+            not self.order("reset", positions_um=self.room.read_off(self.room.state.robot.taken_um))
+            and self.room.state.robot.insertion_locked
+        ):
             self.needle_out()
         if self.room.state.robot.insertion_locked:
             self.needle_out()
@@ -162,7 +165,8 @@ class Monkey:
             self.ordered = False
         begun = len(self.room.line.stage.begun)
         moved_by_order = self.ordered and not self._interrupted()
-        if self.order("reset") and not moved_by_order:
+        read_um = self.room.read_off(self.room.state.robot.taken_um)
+        if self.order("reset", positions_um=read_um) and not moved_by_order:
             self.room.later()
             if len(self.room.line.stage.begun) != begun and self.room.state.question is None:
                 self._fail("re-arming moved the robot")
