@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from case_record.connection import CaseRecordError
 from case_record.holding import HeldStudy, Holding
 from case_record.record import CaseRecord
 from dicom_listener.belonging import ACCEPTED, BOUND, event_body
@@ -41,10 +42,13 @@ def take_study(record: CaseRecord, home: Path, study: str, who: str) -> None:
 
 
 def _waiting(home: Path, study: str) -> HeldStudy:
-    with Holding(home, read_only=True) as holding:
-        for waiting in holding.studies():
-            if waiting.study == study and study:
-                return waiting
+    try:
+        with Holding(home, read_only=True) as holding:
+            for waiting in holding.studies():
+                if waiting.study == study and study:
+                    return waiting
+    except CaseRecordError as error:
+        raise TakingError(f"The holding area cannot be read: {error}.") from error
     raise TakingError(f"There is nothing of the study {study[:64]!r} in the holding area.")
 
 

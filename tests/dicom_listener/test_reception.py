@@ -357,3 +357,9 @@ def test_a_first_hold_that_missed_its_slice_does_not_hold_up_the_case(room):
         room.send("anna")
     assert room.why_held() == []
     assert states(record)[-1] == "assigned"
+
+
+def test_a_study_is_asked_for_where_nothing_was_ever_held(room, tmp_path):
+    record = room.begin()
+    with pytest.raises(TakingError, match="nothing was ever held"):
+        take_study(record, tmp_path / "elsewhere", "1.2.3.4", "Olga")
