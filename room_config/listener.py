@@ -80,9 +80,10 @@ class ListenerConfig(Section):
         "one is used only after the robot has stood that long.",
     )
     late_limit_s: float = Field(
-        default=120.0,
+        default=300.0,
         gt=0,
-        description="A slice that seems later than this is set aside: its clock may have jumped.",
+        description="No slice comes later than this after its acquisition; one that seems to is "
+        "set aside: its clock may have jumped.",
     )
     clock_offset_s: float | None = Field(
         default=None, description="A comparison of the clocks: ours minus the scanner's."
@@ -100,6 +101,12 @@ class ListenerConfig(Section):
         gt=0,
         description="A comparison of the clocks counts for so long; after it slices wait until "
         "somebody compares again. A scanner that says that its clock is synchronized is exempt.",
+    )
+    clock_may_be_set: bool = Field(
+        default=True,
+        description="True: the scanner's clock may be set without anybody's knowing. Where "
+        "prompt_delay_s was not measured, the clocks are compared at each hold then, or each "
+        "acquisition confirmed. False: it never is; one comparison does for comparison_valid_min.",
     )
     arrival_mode: bool = Field(
         default=False,
