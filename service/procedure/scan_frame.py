@@ -46,9 +46,9 @@ class ScanFrame:
     def other_place(self, other: ScanFrame) -> str:
         """What says that positions of the two need not be comparable; empty if nothing does."""
         if _differ(self.frame_of_reference, other.frame_of_reference):
-            return "another frame of reference"
+            return "a different frame of reference"
         if _differ(self.study, other.study):
-            return "another study"
+            return "a different study"
         return ""
 
     def other_protocol(self, other: ScanFrame) -> str:
@@ -59,12 +59,13 @@ class ScanFrame:
         ):
             if mine is None or others is None:
                 if mine is not others:
-                    return f"a {name} where the other says none"
+                    return f"a {name} where the others have none"
             elif not abs(mine - others) <= _SAME_SHARE * abs(mine):
-                return f"another {name} ({others:g} instead of {mine:g})"
+                return f"a different {name} ({others:g} instead of {mine:g})"
         if self.phase_encoding_direction != other.phase_encoding_direction:
             return (
-                f"another phase encoding direction ({other.phase_encoding_direction or 'unknown'} "
+                "a different phase encoding direction "
+                f"({other.phase_encoding_direction or 'unknown'} "
                 f"instead of {self.phase_encoding_direction or 'unknown'})"
             )
         return ""

@@ -36,7 +36,7 @@ def doubt_of_arrival(record: CaseRecord, procedure_id: int, measurement_id: int)
         for row in slices:
             path = record.case_dir / row.path
             if path.exists() and not is_whole(path):
-                raise TamperedError(f"{path}: not the slice that was received")
+                raise TamperedError(f"{path}: not the file that was received")
     except (TamperedError, NotFromInboxError) as error:
         log.error("record", error=str(error))
         return str(error)

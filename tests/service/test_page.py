@@ -211,7 +211,7 @@ def test_a_confirmation_that_comes_second_is_refused_and_says_why(
     page.locator("#confirm").click()
     wait_for(client.state, lambda s: s.question is None)
     second.evaluate("window.hang.click()")
-    expect(second.locator("#refusal")).to_contain_text("not open any more")
+    expect(second.locator("#refusal")).to_contain_text("no longer open")
     second.close()
     assert sum(event.kind == "answered" for event in client.events(after=asked_at)) == 1
     stop_all(client)
