@@ -229,7 +229,7 @@ def test_a_viewer_sees_everything_and_can_move_nothing(browser: Browser, tmp_pat
         assert not serious_violations(page)
         page.locator("#token").fill("wrong")
         button(page, "Log in")
-        expect(page.locator("#login-refusal")).to_contain_text("not known")
+        expect(page.locator("#login-refusal")).to_contain_text("Unknown or expired")
         page.locator("#token").fill(viewer)
         button(page, "Log in")
         expect(page.locator("#who")).to_have_text("Vera (viewer)")
