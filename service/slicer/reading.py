@@ -163,15 +163,15 @@ def _meta(index: bytes, values: bytes) -> dict[str, str]:
     if not index:
         return {}
     if len(index) < 2:
-        raise MessageError("the metadata index is truncated")
+        raise MessageError("the meta-data index is truncated")
     (count,) = struct.unpack_from(">H", index)
     if 2 + count * META_ENTRY.size > len(index):
-        raise MessageError("the metadata index is truncated")
+        raise MessageError("the meta-data index is truncated")
     found, at = {}, 0
     for number in range(count):
         name_size, _, value_size = META_ENTRY.unpack_from(index, 2 + number * META_ENTRY.size)
         if at + name_size + value_size > len(values):
-            raise MessageError("the metadata are truncated")
+            raise MessageError("the meta-data are truncated")
         name = values[at : at + name_size].decode("utf-8", "replace")
         found[name] = values[at + name_size : at + name_size + value_size].decode(
             "utf-8", "replace"
