@@ -33,7 +33,7 @@ def listener(
         typer.Option("--check", help="Try everything once (C-ECHO, write, clock, disk) and end."),
     ] = False,
     exit_with_parent: Annotated[
-        bool, typer.Option("--exit-with-parent", help="End when standard input is closed.")
+        bool, typer.Option("--exit-with-parent", help="Exit when standard input is closed.")
     ] = False,
 ) -> None:
     """Receive slices (C-STORE), keep them durably, and assign them to holds."""

@@ -41,7 +41,7 @@ _ROTATE_EVERY_S = 5.0
 def up(
     config: Annotated[Path, typer.Option("--config", help="The room's TOML file.")],
     exit_with_parent: Annotated[
-        bool, typer.Option("--exit-with-parent", help="End when standard input is closed.")
+        bool, typer.Option("--exit-with-parent", help="Exit when standard input is closed.")
     ] = False,
 ) -> None:
     """Run listener, worker and service; one that ends is started again."""

@@ -57,7 +57,9 @@ def output_of(name: str) -> Output:
     """Raises OutputError for what is no name of an output."""
     found = _NAME.fullmatch(name)
     if found is None:
-        raise OutputError(f"{name!r} is no output: SUBJECT-NUMBER-KIND is, as approach-5-report")
+        raise OutputError(
+            f"{name!r} is not an output; expected SUBJECT-NUMBER-KIND, such as approach-5-report"
+        )
     subject, number, kind = found.groups()
     return Output(subject, int(number), kind)  # type: ignore[arg-type]
 

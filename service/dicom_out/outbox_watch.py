@@ -70,7 +70,7 @@ class OutboxWatch(Collector):
         )
         reached = GaugeMetricFamily(
             "autospine_outbox_reached",
-            "1 unless the last try to reach the destination failed.",
+            "1 unless the last attempt to reach the destination failed.",
             labels=["destination"],
         )
         for name in self._names:
@@ -127,13 +127,13 @@ class OutboxWatch(Collector):
             line = self._lines.get(name)
             since_s = None if line is None else line.failing_since_s
             if line and since_s and time.time() - since_s > self._config.outputs.alarm_after_s:
-                text = f"Nothing can be sent to {name}: {line.reason}"
-                what = "Check the destination and the network. It is tried again until it works."
+                text = f"Cannot send to {name}: {line.reason}"
+                what = "Check the destination and the network. Retrying until it succeeds."
                 yield Condition(f"destination_{name}", "warning", text, what)
             refused = self._counts.get((name, "refused"), 0)
             if refused:
                 text = f"{name} refused {refused} of our DICOM objects"
-                what = "See the outbox for the reasons. They are sent again now and then."
+                what = "See the outbox for the reasons. Sending is retried at intervals."
                 yield Condition(f"refused_{name}", "warning", text, what)
         if any(self._counts.get((name, "not_made"), 0) for name in self._names):
             text = "A DICOM object could not be made"
@@ -161,7 +161,7 @@ class _Child:
                 return
             self._forget()
             self._wait_s = min(max(_RESTART_S, 2 * self._wait_s), _LONGEST_RESTART_S)
-            self.problem = f"The outbox ended with {code}; it is started again"
+            self.problem = f"The outbox ended with {code}; restarting it"
             log.error("the outbox ended", code=code, again_s=self._wait_s)
             self._started_s = now_s
         if now_s >= self._started_s + self._wait_s:

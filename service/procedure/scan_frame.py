@@ -47,9 +47,9 @@ class ScanFrame:
     def other_place(self, other: ScanFrame) -> str:
         """What says that positions of the two need not be comparable; empty if nothing does."""
         if _differ(self.frame_of_reference, other.frame_of_reference):
-            return "another frame of reference"
+            return "a different frame of reference"
         if _differ(self.study, other.study):
-            return "another study"
+            return "a different study"
         return ""
 
     def other_protocol(self, other: ScanFrame) -> str:
@@ -60,12 +60,13 @@ class ScanFrame:
         ):
             if mine is None or others is None:
                 if mine is not others:
-                    return f"a {name} where the other says none"
+                    return f"a {name} where the others have none"
             elif not abs(mine - others) <= _SAME_SHARE * abs(mine):
-                return f"another {name} ({others:g} instead of {mine:g})"
+                return f"a different {name} ({others:g} instead of {mine:g})"
         if self.phase_encoding_direction != other.phase_encoding_direction:
             return (
-                f"another phase encoding direction ({other.phase_encoding_direction or 'unknown'} "
+                "a different phase encoding direction "
+                f"({other.phase_encoding_direction or 'unknown'} "
                 f"instead of {self.phase_encoding_direction or 'unknown'})"
             )
         return ""
@@ -124,11 +125,11 @@ def others_since(record: CaseRecord, seq: int) -> str:
     for event in record.events_of_kind(HELD, after_seq=seq):
         code = event.body.get("code")
         if code == Reason.OTHER_PATIENT:
-            return "another patient"
+            return "a different patient"
         if code == Reason.OTHER_STUDY or event.body.get(SAME_PATIENT):
-            return "another study"
+            return "a different study"
     came = record.scans_since(seq)
-    return "another patient" * any(one["reason_code"] == Reason.OTHER_PATIENT for one in came)
+    return "a different patient" * any(one["reason_code"] == Reason.OTHER_PATIENT for one in came)
 
 
 def _differ(mine: str, others: str) -> bool:

@@ -312,7 +312,7 @@ class ControlLoop:
         """What else is wrong than the state shows."""
         if not self._record.doubt:
             return self._others_wrong()
-        what = "Nothing may rest on it. Keep the folder as it is and begin a new case."
+        what = "Do not rely on it. Keep the folder as it is and start a new case."
         changed = Condition("record_changed", "alarm", self._record.doubt, what)
         return [changed, *self._others_wrong()]
 
@@ -372,7 +372,7 @@ class ControlLoop:
 
     def _fail_by_program(self, running: Procedure, error: Exception) -> None:
         log.exception("procedure failed", procedure=running.name)
-        text = f"the program failed ({type(error).__name__}: {error}); its log says where"
+        text = f"internal error ({type(error).__name__}: {error}); see the log"
         self._end_procedure(running, "failed", text)
 
     def _end_procedure(self, running: Procedure, state: str, reason: str, code: str = "") -> None:
@@ -499,14 +499,18 @@ class ControlLoop:
     def _check(self, asked: _Asked, moving: bool) -> None:
         """Raise ConflictError for an order that may not be carried out now, or not any more."""
         if asked.name not in _ALWAYS and self._stops.voids(asked.asked_s):
-            text = "STOP was pressed after this was asked for: it is not done. Ask again."
+            text = (
+                "STOP was pressed after this was requested, so it was not carried out. Ask again."
+            )
             raise ConflictError("void_after_stop", text)
         age_s = time.monotonic() - asked.asked_s
         if asked.name not in _ALWAYS and not age_s <= OLDEST_ORDER_S:
-            text = f"This was asked for {age_s:.1f} s ago: it is not done any more. Ask again."
+            text = f"This was requested {age_s:.1f} s ago, so it was not carried out. Ask again."
             raise ConflictError("stale_order", text)
         if moving and asked.name not in _WHILE_MOVING:
-            raise ConflictError("moving", "The robot moves: wait until it stands, or press STOP.")
+            raise ConflictError(
+                "moving", "The robot is moving: wait until it stops, or press STOP."
+            )
 
     def _publish_if_due(self) -> bool:
         """Publish when something was recorded, and every now and then; whether it was done."""
@@ -526,7 +530,7 @@ class ControlLoop:
         except RECORD_FAULTS:
             raise
         except Exception as error:
-            wrong = f"The state cannot be told ({type(error).__name__}: {error})"
+            wrong = f"Cannot report the state ({type(error).__name__}: {error})"
             self._publish_held(Condition("state", "alarm", wrong, "See the log."), time.time())
             if time.monotonic() - self._said_s > _SAID_AGAIN_S:
                 self._said_s = time.monotonic()

@@ -50,7 +50,7 @@ def slice_file(record: CaseRecord, slice_id: int) -> Path:
     """Return the DICOM file of a slice, bit for bit as it was received."""
     path = record.case_dir / record.slice(slice_id).path
     if not path.is_file():
-        raise ImageMissingError(f"slice {slice_id}: its file is not there any more")
+        raise ImageMissingError(f"slice {slice_id}: its file no longer exists")
     return path
 
 

@@ -53,4 +53,4 @@ def check_slice_file(record: CaseRecord, row: SliceRow) -> None:
     except NotFromInboxError:
         content = path.read_bytes()
     if sha256_of(content) != row.sha256:
-        raise TamperedError(f"{path}: not the slice that was received")
+        raise TamperedError(f"{path}: not the file that was received")

@@ -98,7 +98,7 @@ def scene_of(state: RoomState, guide: GuideConfig | None = None) -> Scene:
 
 def stale(state: RoomState) -> RoomState:
     """A state that is old: nobody knows what the room does now, and where its guide is."""
-    text = "The control loop does not say what the room is doing."
+    text = "The control loop is not reporting what the room is doing."
     robot = state.robot.model_copy(update={"linked": False, "problem": text, "phase": "STALE"})
     change = {"robot": robot, "ready": False, "procedure": None, "prompt": text}
     return state.model_copy(update=change)

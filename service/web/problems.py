@@ -122,7 +122,7 @@ def add_problems(app: FastAPI) -> None:
 
     @app.exception_handler(CommandTimeoutError)
     async def late(_: Request, __: CommandTimeoutError) -> JSONResponse:
-        detail = "The control loop did not answer in time; look at the state before trying again."
+        detail = "The control loop did not answer in time; check the state before trying again."
         return problem(503, "no_answer", detail)
 
     @app.exception_handler(RequestValidationError)
@@ -137,7 +137,7 @@ def add_problems(app: FastAPI) -> None:
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> JSONResponse:
         structlog.get_logger().error("request failed", path=request.url.path, exc_info=error)
-        return problem(500, "internal_error", "The service failed; its log says how.")
+        return problem(500, "internal_error", "Internal error; see the service's log.")
 
 
 def _invalid(error: RequestValidationError) -> JSONResponse:

@@ -41,7 +41,7 @@ def test_five_cases_one_after_the_other_each_of_its_own(tmp_path):
         state = client.state()
         assert state.case_folder is None
         assert state.cases_begin_here
-        assert state.prompt == "Begin a case."
+        assert state.prompt == "Start a case."
         for order in (client.describe_case, client.set_target):
             error = refusal(order, (1.0, 2.0, 3.0) if order == client.set_target else "x")
             assert (error.status, error.code) == (409, "no_case")

@@ -100,7 +100,7 @@ def test_a_target_in_tissue_shifts_both_fiducials_alike(tmp_path, start):
     [
         ((6.0, -22.0, -19.0), (6.0, -140.0, -19.0), r"138\.0 mm below .* reaches 120 mm"),
         ((6.0, -22.0, -19.0), (6.0, 5.0, -19.0), r"7\.0 mm above the lower plane"),
-        ((6.0, -22.0, -19.0), (6.0, -22.0, -19.0), "make no line"),
+        ((6.0, -22.0, -19.0), (6.0, -22.0, -19.0), "do not define a line"),
     ],
 )
 def test_a_target_that_no_needle_of_this_guide_reaches_is_refused(tmp_path, start, entry, at, said):

@@ -226,7 +226,7 @@ def test_a_target_outside_of_the_image_is_not_drawn_but_said(record):
     state = dataset_of(far, READY_PRESENTATION)
     layers = {annotation.GraphicLayer for annotation in state.GraphicAnnotationSequence}
     assert layers == {"FIDUCIAL", "NOTES"}
-    assert "outside of this image" in words_of(state)
+    assert "outside this image" in words_of(state)
 
 
 # What the standard asks for
@@ -304,7 +304,7 @@ def test_a_reconstruction_or_a_slice_that_was_changed_is_found_out(record, tmp_p
     write_export(record, tmp_path / "a.zip")
     received = record.case_dir / record.slice(result["slice_id"]).path
     flip(received)
-    with pytest.raises(TamperedError, match="not the slice that was received"):
+    with pytest.raises(TamperedError, match="not the file that was received"):
         write_export(record, tmp_path / "b.zip")
     assert not (tmp_path / "b.zip").exists()
     flip(received)
@@ -329,16 +329,16 @@ def test_all_uids_are_different_and_only_reports_have_a_series_of_their_own(reco
 
 @pytest.mark.parametrize("name", ["", "approach-0-report", "../case-1-report", "event-1-report"])
 def test_what_is_no_name_of_an_output_is_refused(name):
-    with pytest.raises(OutputError, match="is no output"):
+    with pytest.raises(OutputError, match="is not an output"):
         output_of(name)
 
 
 def test_what_there_is_nothing_about_is_refused(record):
     with pytest.raises(CaseRecordError, match="there is no measurement 99"):
         make_output(record, Output("measurement", 99, "report"))
-    with pytest.raises(CaseRecordError, match="procedure 99 did not come to READY"):
+    with pytest.raises(CaseRecordError, match="procedure 99 did not reach READY"):
         make_output(record, Output("approach", 99, "report"))
-    with pytest.raises(CaseRecordError, match="event 1 is no puncture"):
+    with pytest.raises(CaseRecordError, match="event 1 is not a puncture"):
         make_output(record, Output("puncture", 1, "report"))
 
 
@@ -352,7 +352,7 @@ def test_the_command_says_in_one_line_why_it_makes_none(record):
     ]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert done.stderr.strip().splitlines()[-1].endswith("procedure 99 did not come to READY")
+    assert done.stderr.strip().splitlines()[-1].endswith("procedure 99 did not reach READY")
 
 
 def violations(dataset: Dataset) -> list[str]:

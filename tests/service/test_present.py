@@ -499,7 +499,7 @@ def test_slices_of_another_protocol_end_the_approach_that_was_begun_without_them
     room.do(lambda: room.header.update(pixel_bandwidth_hz=250.0))
     room.call("start_approach")
     state = room.run_to_end()
-    assert "another pixel bandwidth (250 instead of 500)" in state.last_outcome
+    assert "a different pixel bandwidth (250 instead of 500)" in state.last_outcome
     assert not state.ready
 
 
