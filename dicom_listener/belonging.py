@@ -16,6 +16,9 @@ from dicom_slice.patient import Identity
 from dicom_slice.reasons import Reason, SetAside
 
 BOUND, ACCEPTED = "case_bound", "study_accepted"
+# a slice that waits outside of the case; of another case's study it is said whether it may be of
+# this patient
+HELD, SAME_PATIENT = "slice_held", "same_patient"
 
 
 @dataclass(frozen=True)
@@ -75,6 +78,11 @@ def why_not_of(binding: Binding | None, whose: Identity) -> SetAside | None:
             "it has a different frame of reference: the table or the patient was moved",
         )
     return None
+
+
+def may_be_same_patient(binding: Binding | None, whose: Identity) -> bool:
+    """False only where both are known, and are two."""
+    return binding is not None and not _differ(binding.patient, whose.patient)
 
 
 def _differ(bound: str, found: str) -> bool:

@@ -238,7 +238,7 @@ def _loop(
         try:
             if reception.follow():
                 _requeue(reception, received)
-            _take_received(reception, received, attempts)
+            _take_received(reception, received, attempts, presence)
             reception.turn()
             for way_in in ways_in:
                 while way_in.alarms:
@@ -290,12 +290,15 @@ def _requeue(reception: Reception, received: "SimpleQueue[Path]") -> int:
     return len(left_over)
 
 
-def _take_received(reception: Reception, received: "SimpleQueue[Path]", attempts: Attempts) -> None:
+def _take_received(
+    reception: Reception, received: "SimpleQueue[Path]", attempts: Attempts, presence: Presence
+) -> None:
     """Wait for at most one poll, then take whatever is there."""
     try:
         path = received.get(timeout=_POLL_S)
         while True:
             _take(reception, path, attempts)
+            presence.beat()
             path = received.get_nowait()
     except Empty:
         return

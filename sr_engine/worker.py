@@ -7,6 +7,8 @@ is recorded as failed, with the reason.
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import io
 import math
 import sqlite3
 import time
@@ -172,7 +174,7 @@ def measure(
         found = localize_request(frames, request.method, request.request, psf)
         result = describe_result(frames, found)
         result["point_spread"] = asdict(psf)
-        result["reconstruction"] = _reconstruction(record.case_dir, number, frames, factor)
+        result |= _reconstruction(record.case_dir, number, frames, factor)
         json_text(result)  # NaN, or a value of no known type, is found here and not in the record
     except (EngineError, UnusableSlicesError, UnusableError) as error:
         _fail(record, number, _code_of(error), str(error))
@@ -413,19 +415,23 @@ def _common_geometry(slices: list[SliceRow]) -> SliceGeometry:
     return first
 
 
-def _reconstruction(case_dir: Path, number: int, frames: Frames, factor: int) -> str | None:
-    """Write the super-resolution image as .npy beside the record; None where there is none."""
+def _reconstruction(case_dir: Path, number: int, frames: Frames, factor: int) -> dict[str, Any]:
+    """Write the super-resolution image as .npy beside the record; its name (None where there is no
+    image), and what the file is sworn to be.
+    """
     if len(frames.pixels) < factor**2:
-        return None
+        return {"reconstruction": None}
     try:
         made = reconstruct(frames.pixels, frames.shifts_px, factor=factor, method="fourier")
     except SingularShiftSetError:
-        return None  # slices at one place only: nothing finer to show
+        return {"reconstruction": None}  # slices at one place only: nothing finer to show
     folder = case_dir / IMAGES
     folder.mkdir(exist_ok=True)
     path = folder / f"measurement-{number}.npy"
     temporary = path.with_suffix(".part")
-    with temporary.open("wb") as file:
-        np.save(file, made.image.astype(np.float32))
+    buffer = io.BytesIO()
+    np.save(buffer, made.image.astype(np.float32))
+    temporary.write_bytes(buffer.getvalue())
     temporary.replace(path)
-    return f"{IMAGES}/{path.name}"
+    digest = hashlib.sha256(buffer.getvalue()).hexdigest()
+    return {"reconstruction": f"{IMAGES}/{path.name}", "reconstruction_sha256": digest}

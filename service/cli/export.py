@@ -28,6 +28,7 @@ from service.room.images import (
     reconstruction_pixels,
     slice_pixels,
 )
+from service.room.integrity import check_slice_file
 
 app = typer.Typer(add_completion=False)
 FORMAT = "autospine-case-export"
@@ -140,8 +141,10 @@ def _members(record: CaseRecord, missing: list[str]) -> Iterator[tuple[str, byte
         if not path.is_file():
             missing.append(row.path)
             continue
+        check_slice_file(record, row)
         yield f"dicom/{Path(row.path).name}", path.read_bytes()
     for path in sorted((record.case_dir / OUTPUTS).glob("*.dcm")):
+        record.is_sealed(f"{OUTPUTS}/{path.name}")
         yield f"outputs/{path.name}", path.read_bytes()
     yield from _images(record)
 

@@ -17,8 +17,15 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 from case_record.cases import Cases
+from case_record.presence import Hanging
 from room_config.load import Config
-from service.dicom_out.outbox_store import STATES, Line, OutboxStore, cases_with_open_deliveries
+from service.dicom_out.outbox_store import (
+    PRESENCE,
+    STATES,
+    Line,
+    OutboxStore,
+    cases_with_open_deliveries,
+)
 from service.room.alarms import Condition
 
 _LOOK_S = 0.5
@@ -26,6 +33,7 @@ _RESTART_S = 1.0
 _LONGEST_RESTART_S = 60.0
 _STABLE_S = 60.0
 _END_S = 5.0
+_HUNG_S = 60.0
 log = structlog.get_logger()
 
 
@@ -79,9 +87,12 @@ class OutboxWatch(Collector):
         with contextlib.suppress(sqlite3.Error, OSError):
             self._folders.update(cases_with_open_deliveries(self._cases))
         child = _Child(self._config)
+        hanging = Hanging(self._cases.home, "outbox-watch", _HUNG_S)
         try:
             while not self._closing.wait(_LOOK_S):
                 try:
+                    if hanging.look([PRESENCE]):
+                        child.kill()
                     child.keep_alive()
                     with contextlib.suppress(sqlite3.Error, OSError):  # looked at again soon
                         self._look()
@@ -90,6 +101,7 @@ class OutboxWatch(Collector):
                     log.exception("outbox watch")
         finally:
             child.end()
+            hanging.close()
 
     def _look(self) -> None:
         """At the open case, and at those before it of which something is still to be sent."""
@@ -168,6 +180,13 @@ class _Child:
         with contextlib.suppress(OSError):  # it has ended already: seen at the next look
             self._process.stdin.write(self._config.model_dump_json().encode() + b"\n")
             self._process.stdin.flush()
+
+    def kill(self) -> None:
+        """It runs and does nothing any more; seen as ended at the next look."""
+        log.error("the outbox hangs: killed")
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
 
     def _forget(self) -> None:
         if self._process is not None and self._process.stdin is not None:

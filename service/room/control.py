@@ -7,6 +7,7 @@ heartbeats that keep the bridge's deadman quiet leave only from this loop.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
@@ -19,6 +20,7 @@ from typing import Any
 import structlog
 
 from case_record.cases import Cases, CasesError
+from case_record.presence import Presence
 from case_record.record import CaseRecord, CaseRecordError, RecordUnavailableError
 from case_record.rows import Procedure
 from room_config.load import Config
@@ -131,6 +133,7 @@ class ControlLoop:
         self._failed_at: tuple[int, str] | None = None
         self._said_s = -_SAID_AGAIN_S
         self._commands: Commands | BetweenCases | None = None
+        self._presence: Presence | None = None
         self._stops = StopLatch()
 
     @property
@@ -210,6 +213,8 @@ class ControlLoop:
         finally:
             self._link.client.close()
             self._commands = None
+            if self._presence is not None:
+                self._presence.close()
             if self._failure is not None:
                 self._on_failure()
 
@@ -538,12 +543,19 @@ class ControlLoop:
         self._show(held(self._state, robot, wrong, since_s))
 
     def _show(self, state: RoomState) -> None:
+        self._beat()
         self._published_at_s = time.monotonic()
         self._state = state
         if self._owed and (state.case_folder is None) == (self._folder_to_serve() is None):
             while self._owed:
                 future, result = self._owed.pop()
                 future.set_result(result)
+
+    def _beat(self) -> None:
+        """Whoever supervises the service sees that this loop turns."""
+        with contextlib.suppress(OSError):  # a disk that takes nothing
+            self._presence = self._presence or Presence(self._cases.home, "service")
+            self._presence.beat()
 
 
 class _UnusableError(Exception):

@@ -28,7 +28,8 @@ from service.procedure.scan_frame import (
     ScanFrame,
     frame_of,
     other_place_since,
-    other_study_held_since,
+    others_since,
+    seen_seq,
 )
 from service.procedure.targets import current_entry_number, current_target, why_void_target
 from service.room.readiness import ready_arrival
@@ -273,13 +274,10 @@ def _elsewhere(facts: Mapping[str, Any], status: BridgeStatus) -> Lost | None:
 
 def _scanner_changed(record: CaseRecord, measurement: Measurement) -> Lost | None:
     """Slices that came since, used or not, of another study, frame of reference or protocol."""
-    seen, since = frame_of(record, measurement), measurement.requested_seq
+    seen, since = frame_of(record, measurement), seen_seq(record, measurement)
     if seen is None:
         return None
-    other = other_place_since(record, since, seen)
-    if not other and other_study_held_since(record, since):
-        other = "a different study"
-    if other:
+    if other := other_place_since(record, since, seen) or others_since(record, since):
         return Lost(
             "other_place", f"slices from {other} have since arrived: the table may have moved"
         )

@@ -20,6 +20,7 @@ from starlette.exceptions import HTTPException
 
 from case_record.cases import CasesError, NoCaseError
 from case_record.record import CaseRecordError, RecordUnavailableError
+from case_record.seals import TamperedError
 from service.room.images import ImageMissingError
 from service.room.readiness import ConflictError
 
@@ -104,6 +105,10 @@ def add_problems(app: FastAPI) -> None:
     @app.exception_handler(CaseRecordError)
     async def unknown(_: Request, error: CaseRecordError) -> JSONResponse:
         return problem(404, "not_found", str(error))
+
+    @app.exception_handler(TamperedError)
+    async def changed(_: Request, error: TamperedError) -> JSONResponse:
+        return problem(409, "record_changed", str(error))
 
     @app.exception_handler(RecordUnavailableError)
     @app.exception_handler(sqlite3.OperationalError)

@@ -176,6 +176,9 @@ def test_five_patients_in_a_row_with_late_slices_of_the_one_before(room):
             assert room.why_held()[-1] == "other_case"
         for _ in range(3):
             room.send(name)
+        if number:
+            room.send(names[number - 1])
+            assert records[-1].last_event("slice_held").body["same_patient"] is False
         room.finish()
         room.send(name)
         assert room.why_held()[-1] == "no_case_open"
@@ -184,6 +187,17 @@ def test_five_patients_in_a_row_with_late_slices_of_the_one_before(room):
         record.verify_events()
         assert says(record.case_dir, name)
         assert [other for other in names if other != name and says(record.case_dir, other)] == []
+
+
+def test_an_earlier_study_of_the_same_patient_is_said_to_be_of_the_same(room):
+    room.begin()
+    room.send("anna")
+    room.finish()
+    record = room.begin()
+    room.send("anna", StudyInstanceUID="1.2.826.1.2")
+    room.send("anna")
+    assert room.why_held()[-1] == "other_case"
+    assert record.last_event("slice_held").body["same_patient"] is True
 
 
 def test_two_patients_whose_slices_come_interleaved(room):

@@ -17,6 +17,7 @@ from receivers import needs_program
 from recorded_case import OFFSET_MM, TOLERANCE_MM, come_to_ready, make_case, puncture
 
 from case_record.record import CaseRecord, CaseRecordError
+from case_record.seals import TamperedError
 from service.cli.export import write_export
 from service.dicom_out.codes import CENTRE, CENTRE_ALONG, DEPTH, DISTANCE, PROBABILITY, TOLERANCE
 from service.dicom_out.errors import OutputError
@@ -28,6 +29,7 @@ from service.dicom_out.make import (
     output_of,
     outputs_to_send,
 )
+from service.room.images import reconstruction_pixels
 
 READY_REPORT = Output("approach", 1, "report")
 READY_PRESENTATION = Output("approach", 1, "presentation")
@@ -265,6 +267,47 @@ def test_an_output_made_anew_from_the_same_record_is_the_same_to_the_byte(record
         before = path.read_bytes()
         path.unlink()
         assert make_output(record, output).read_bytes() == before, output.name
+
+
+def flip(path):
+    content = bytearray(path.read_bytes())
+    content[-20] ^= 1
+    path.write_bytes(content)
+
+
+def test_an_output_that_was_changed_is_not_handed_out_and_one_from_elsewhere_is_made_anew(record):
+    path = make_output(record, READY_REPORT)
+    made = path.read_bytes()
+    flip(path)
+    with pytest.raises(TamperedError, match="not the file that was made"):
+        make_output(record, READY_REPORT)
+    flip(path)
+    other = Output("measurement", 1, "presentation")
+    other.path(record.case_dir).write_bytes(made)  # laid there by whoever, under that name
+    assert make_output(record, other).read_bytes() != made
+    record.verify()
+
+
+def test_a_reconstruction_or_a_slice_that_was_changed_is_found_out(record, tmp_path):
+    output = next(o for o in outputs_to_send(record) if o.kind == "image")
+    result = record.measurement(output.number).result
+    image = record.case_dir / result["reconstruction"]
+    output.path(record.case_dir).unlink(missing_ok=True)
+    flip(image)
+    with pytest.raises(TamperedError):
+        reconstruction_pixels(record, output.number)
+    with pytest.raises(TamperedError):
+        make_output(record, output)
+    with pytest.raises(TamperedError, match="not the image that was made"):
+        write_export(record, tmp_path / "a.zip")
+    flip(image)
+    write_export(record, tmp_path / "a.zip")
+    received = record.case_dir / record.slice(result["slice_id"]).path
+    flip(received)
+    with pytest.raises(TamperedError, match="not the file that was received"):
+        write_export(record, tmp_path / "b.zip")
+    assert not (tmp_path / "b.zip").exists()
+    flip(received)
 
 
 def test_an_output_that_is_there_is_not_made_again(record):
