@@ -35,7 +35,7 @@ def attend_room(room: DemoRoom, note: Callable[[str], None]) -> None:
     for number, step in enumerate(_STEPS, start=1):
         note(f"{number}. {step.format(entry=entry)}")
     note("STOP (or Esc) works at any time. Ctrl-C here closes the room.")
-    note(f"type a fault name here to switch it on or off: {', '.join(FAULTS)}")
+    note(f"faults: type a name here to switch one on or off: {', '.join(FAULTS)}")
     switches = FaultSwitches(room, note)
     lines = _lines_of_stdin()
     while True:
