@@ -84,7 +84,7 @@ class PmdController:
         self.doubts: dict[str, str] = {}  # what the board does not answer, and what follows
         self.park_shift_um: float | None = None
         self.at_rest_um: float | None = None
-        self.expected_parked: bool | None = None
+        self.expected_parked: bool | None = None  # None while that is changed
         self.mark: int | None = None  # what H was set to; None: H cannot be used
         self.can_store = True
         self.estop = False  # the emergency stop's input is low
@@ -274,7 +274,7 @@ class PmdController:
     def unpark(self) -> Steps[None]:
         yield from self.read_status()
         yield from self.check_status()
-        if self.parked:
+        if self.parked or self.expected_parked is None:  # None: a parking may be under way
             yield pmd_protocol.unpark(self.address, self.config.waveform)
             yield from self._await_parked(False)
             yield from self.read_speed_cap()

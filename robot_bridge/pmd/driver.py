@@ -7,6 +7,7 @@ drivers, not tried on hardware yet: it says so whenever it starts.
 """
 
 import logging
+import math
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
@@ -303,7 +304,7 @@ class PmdMotors:
         if failures := self._ports.send_stop():
             self._lose_port("; ".join(failures))
             return
-        self._for_each_axis(lambda axis: axis.confirm_stop(), "stop")
+        self._for_each_axis(_stand_still, "stop")
 
     def _all_reached(self) -> bool:
         return all(
@@ -315,7 +316,7 @@ class PmdMotors:
     def _status(self) -> MotorStatus:
         fault = self._fault or next((a.fault for a in self._axes.values() if a.fault), None)
         return MotorStatus(
-            moving=bool(self._motion),
+            moving=bool(self._motion) or any(axis.unread for axis in self._axes.values()),
             reached=self._reached,
             readback_um={name: axis.readback_um() for name, axis in self._axes.items()},
             certain_axes=frozenset(
@@ -324,6 +325,11 @@ class PmdMotors:
             parked=all(axis.parked for axis in self._axes.values()),
             fault=fault[0] if fault else None,
             fault_text=fault[1] if fault else "",
+            within_um={
+                name: math.ceil(axis.within_um)
+                for name, axis in self._axes.items()
+                if axis.within_um is not None
+            },
             warnings=(UNTRIED, *self._doubts(), *self._park_warnings()),
             setting_up=any(axis.needs_setup for axis in self._axes.values()),
             boards={name: axis.board for name, axis in self._axes.items()},
@@ -363,7 +369,7 @@ class PmdMotors:
         self._motion, self._other = {}, {}
         self._fault, self._reached = (code, text), False
         for axis in self._axes.values():
-            axis.certain = False
+            axis.certain = axis.unread = False
             axis.needs_setup = True
         self._reconnect_s = self._clock() + RECONNECT_PAUSE_S
 
@@ -410,8 +416,17 @@ class PmdMotors:
         )
         if self._reconnect_s is not None:
             self._ports.close()  # initialised again from the start, by `poll`
+        for name, axis in self._axes.items():
+            if axis.unread and axis.config.controller in self._ports.lines:
+                self._other[name] = self._line_of(axis).start(axis.locate(), f"place of {name}")
         if failures:
             raise MotorError("stop_unconfirmed", "; ".join(failures))
+
+
+def _stand_still(axis: PmdAxis) -> Procedure:
+    yield from axis.confirm_stop()
+    if axis.unread:
+        yield from axis.locate()
 
 
 def _look_after(axis: PmdAxis) -> Procedure:
