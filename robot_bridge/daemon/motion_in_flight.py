@@ -168,10 +168,8 @@ class MotionInFlight:
         if motion is None:
             return
         match progress(motion, self._motors.status, now_s, self._timeout_s):
-            case Runs():
+            case Runs() | RunsOut():  # a stop that was not confirmed is said again by the bridge
                 return
-            case RunsOut():
-                self._motors.stop_again_if_due()
             case Faulty(ending):
                 self._stop_for(ending.code, ending.text)
                 motion.ending = ending  # the latched stop does not say STOPPED of it

@@ -8,6 +8,7 @@ An axis that stands where it is asked to be is not commanded at all.
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 
 from robot_bridge.daemon.config import AxisConfig
 from robot_bridge.pmd import protocol as pmd_protocol
@@ -92,6 +93,7 @@ class PmdAxis(PmdController):
         """Where an axis stands that was stopped on its way."""
         try:
             yield from self.read_position_surely()
+            yield from self.read_status()  # a count that a reset has put to zero is no place
         except PmdError:
             self.certain = False
             self.unread = False
@@ -103,7 +105,7 @@ class PmdAxis(PmdController):
         self.unread = False
 
     def stands_at(self, setpoint_um: float) -> bool:
-        return abs(self.position_um - setpoint_um) <= self.config.tolerance_um
+        return self._is_near(self.position_um, setpoint_um)
 
     def set_up(self) -> Procedure:
         """Raises PmdError; afterwards the settings are ours. Nothing moves."""
@@ -380,6 +382,18 @@ class PmdAxis(PmdController):
             status = yield from self.read_status()
             if not status & (Status.RUNNING | Status.TARGET_MODE):
                 break
-            yield pmd_protocol.stop(self.address)
+            if "S" in self.doubts:
+                yield from self._hold_here()
+            else:
+                yield pmd_protocol.stop(self.address)
         if not status & (ERRORS | Status.RESET | Status.OVERHEAT) and not self.needs_setup:
             self.fault = None
+
+    def _hold_here(self) -> Steps[None]:
+        """In place of a stop that a board was not seen to understand: its target is where it is."""
+        try:
+            count = (yield from self.ask("E")).integer()
+            target = pmd_protocol.move_to_count(self.address, count, self.speed_hz)
+            yield replace(target, repeatable=False)
+        except PmdError:
+            return  # whether it stands is asked again
