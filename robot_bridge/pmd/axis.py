@@ -190,7 +190,7 @@ class PmdAxis(PmdController):
         try:
             yield from self._go(pmd_protocol.move_to_count(self.address, target, self.speed_hz))
         except PmdNoValueError:  # no echo: what it does is seen below, and a target is absolute
-            self.doubts["T"] = "a motion is not confirmed by an echo"
+            self.doubts["T"] = "the echo does not confirm the motion"
         watch = ProgressWatch(self.config, abs(setpoint_um - self.position_um), self.clock())
         try:
             yield from self._follow(setpoint_um, watch)
@@ -325,12 +325,14 @@ class PmdAxis(PmdController):
             if not status & Status.RUNNING and (yield from self.ask("J")).integer() == 0:
                 return
             if self.clock() > deadline_s:
-                raise self.error("motion_timeout", f"runs longer than {run.duration_s:.1f} s")
+                raise self.error("motion_timeout", f"still running after {run.duration_s:.1f} s")
             yield Pause(POLL_PAUSE_S)
 
     def _microstep_phase(self) -> Steps[int | None]:
         """None if the board does not tell; the end of a run is then known by its status alone."""
-        reply = yield from self.ask_if_it_can("Y0", "a run's length cannot be checked afterwards")
+        reply = yield from self.ask_if_it_can(
+            "Y0", "the length of a run cannot be checked afterwards"
+        )
         if reply is None:
             return None
         values = reply.integers()

@@ -22,8 +22,8 @@ def agrees(moved_um: float, distance_um: float) -> bool:
 
 def disagreement(moved_um: float, distance_um: float) -> str:
     return (
-        f"the motor went {distance_um:+.0f} um by its steps and the encoder {moved_um:+.0f} um: "
-        "encoder, its direction, counts_per_mm or the step lengths are wrong"
+        f"the motor moved {distance_um:+.0f} um by its steps but {moved_um:+.0f} um by the "
+        "encoder: the encoder, its direction, counts_per_mm or the step lengths are wrong"
     )
 
 
@@ -51,9 +51,9 @@ class ProgressWatch:
         if error_um < self._best_um:
             self._best_um, self._best_s, self._looks = error_um, now_s, 0
         if self.is_away(error_um):
-            return "runaway", f"moves away, {error_um:.0f} um from the setpoint"
+            return "runaway", f"is moving away, {error_um:.0f} um from the setpoint"
         far = error_um > self._far_um and self._looks >= LOOKS_MIN
         window_s = (FAR_WINDOW_S if far else STALL_WINDOW_S) + self._resolution_s
         if now_s - self._best_s > window_s:
-            return "stalled", f"stands {error_um:.0f} um from the setpoint"
+            return "stalled", f"stalled {error_um:.0f} um from the setpoint"
         return None

@@ -48,8 +48,8 @@ class RobotCommands:
         if said_um is None or said_um.keys() != taken.keys():
             raise ConflictError(
                 "position_unconfirmed",
-                f"{in_words(taken)} Nothing is armed until somebody says that they stand there "
-                "(positions_um), or where they stand.",
+                f"{in_words(taken)} The robot is not armed until someone confirms these "
+                "positions or gives the right ones (positions_um).",
             )
         counted_um = {axis: status.positions_um.get(axis, 0) for axis in taken}
         within_um = {
