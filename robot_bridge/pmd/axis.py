@@ -53,6 +53,7 @@ class PmdAxis(PmdController):
         self._run: Run | None = None
         self._cut: Run | None = None  # a run that did not come to its end
         self._pace = Pace()
+        self._holds_motion = False  # a motion is stored on the board
         self._begun_s = 0.0  # when what moves it was sent
         self.unread = False  # it was stopped on its way, and nobody has asked yet where it stands
         self.within_um: float | None = None  # after a run that was cut short: of its readback
@@ -101,6 +102,7 @@ class PmdAxis(PmdController):
         self.unread = False
 
     def refresh(self) -> Procedure:
+        yield from self._forget_stored()  # of a motion that was stopped
         yield from super().refresh()
         self.unread = False
 
@@ -175,13 +177,15 @@ class PmdAxis(PmdController):
         if not self.can_store:
             yield command
             return
+        self._holds_motion = True
         yield pmd_protocol.store(command)
         self._begun_s = self.clock()
         yield pmd_protocol.run_stored(command)
 
     def _forget_stored(self) -> Steps[None]:
-        if self.can_store:
+        if self.can_store and self._holds_motion:
             yield pmd_protocol.overwrite_stored(self.address)
+        self._holds_motion = False
 
     def _closed_leg(self, setpoint_um: int) -> Steps[None]:
         self.at_rest_um = None

@@ -147,8 +147,8 @@ def check_travel(setpoints_um: Mapping[str, int], travel: Mapping[str, Travel]) 
         limits = travel[axis]
         if not limits.min_um <= setpoint_um <= limits.max_um:
             unsure = (
-                f" (it is known to within {limits.unsure_um / 1000:.3f} mm only where the axis "
-                "stands: measure, home it or declare its position, and there is more)"
+                f" (its position is known only to within {limits.unsure_um / 1000:.3f} mm, and the "
+                "travel is narrowed by that: measure, home it or declare its position)"
             )
             raise PlanRefusedError(
                 f"axis {axis}: setpoint {setpoint_um / 1000:.3f} mm is outside its travel "
