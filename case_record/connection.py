@@ -89,7 +89,7 @@ class Connection:
         if version > SCHEMA_VERSION:
             raise CaseRecordError(
                 f"{self.case_dir}: the case record has schema version {version}, newer than "
-                f"this program's {SCHEMA_VERSION}; it was left untouched"
+                f"this program's {SCHEMA_VERSION}; it was left unchanged"
             )
         return version
 

@@ -84,7 +84,7 @@ class Sole:
                 other = os.pread(self._file, 20, 0).decode("ascii", "replace").strip() or "unknown"
                 self.close()
                 raise CaseRecordError(
-                    f"{case_dir}: another {name} (process {other}) works here; end that one first"
+                    f"{case_dir}: another {name} (process {other}) is using it; stop that one first"
                 )
             time.sleep(_RETRY_S)
         os.ftruncate(self._file, 0)

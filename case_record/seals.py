@@ -65,7 +65,7 @@ class Seals(Events):
                     raise self._tampered(f"{table} {row} was changed")
         for (table, row), digest in latest.items():
             if any(digest):
-                raise self._tampered(f"{table} {row} was taken away")
+                raise self._tampered(f"{table} {row} was removed")
         events = int(self._db.execute("SELECT COUNT(*) FROM event").fetchone()[0])
         return Verified(events, number, (previous or FIRST).hex())
 
@@ -107,7 +107,7 @@ class Seals(Events):
             " COALESCE((SELECT MAX(seq) FROM slice), 0))"
         )[0]
         if last is None or last < highest:
-            raise self._tampered("the order of what happened does not fit")
+            raise self._tampered("the order of events does not match")
 
     def _rows(self, statement: str) -> list[tuple[Any, ...]]:
         try:

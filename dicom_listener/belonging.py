@@ -69,13 +69,13 @@ def why_not_of(binding: Binding | None, whose: Identity) -> SetAside | None:
     if binding is None:
         return None
     if _differ(binding.patient, whose.patient):
-        return SetAside(Reason.OTHER_PATIENT, "it is of another patient than this case")
+        return SetAside(Reason.OTHER_PATIENT, "it belongs to a different patient")
     if whose.study not in binding.studies:
-        return SetAside(Reason.OTHER_STUDY, "it is of another study than this case")
+        return SetAside(Reason.OTHER_STUDY, "it belongs to a different study")
     if _differ(binding.frame_of_reference, whose.frame_of_reference):
         return SetAside(
             Reason.OTHER_FRAME,
-            "its frame of reference is another one: the table or the patient was moved",
+            "it has a different frame of reference: the table or the patient was moved",
         )
     return None
 

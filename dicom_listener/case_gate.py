@@ -65,7 +65,7 @@ class CaseGate:
             return None
         whose = arrival.identity
         if not whose.study:
-            return SetAside(Reason.UNKNOWN_STUDY, _reason_of(rows, "its study is not known"))
+            return SetAside(Reason.UNKNOWN_STUDY, _reason_of(rows, "its study is unknown"))
         if self.binding is not None and whose.study in self.binding.studies:
             why = why_not_of(self.binding, whose)
             return why if why is not None and why.code == Reason.OTHER_PATIENT else None
@@ -77,7 +77,7 @@ class CaseGate:
         if any(row.state != "quarantined" or row.reason_code in _AT_A_HOLD for row in rows):
             return None
         reason = _reason_of(rows, "set aside")
-        return SetAside(Reason.NO_SLICE_USED, f"{reason}; no slice of this case was used yet")
+        return SetAside(Reason.NO_SLICE_USED, f"{reason}; no slice of this case has been used yet")
 
     def hold(self, arrival: Arrival, why: SetAside) -> None:
         """Keep the file out of the case, whose record says that, and no more of whom it shows."""

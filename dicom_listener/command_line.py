@@ -30,7 +30,7 @@ def listener(
     config: Annotated[Path, typer.Option("--config", help="The room's TOML file.")],
     check: Annotated[
         bool,
-        typer.Option("--check", help="Try everything once (C-ECHO, write, clock, disk) and end."),
+        typer.Option("--check", help="Test everything once (C-ECHO, write, clock, disk) and exit."),
     ] = False,
     exit_with_parent: Annotated[
         bool, typer.Option("--exit-with-parent", help="Exit when standard input is closed.")

@@ -126,7 +126,7 @@ def _zone(name: str) -> ZoneInfo | None:
     try:
         return ZoneInfo(name)
     except (ZoneInfoNotFoundError, ValueError):
-        raise ConfigError(f"listener.scanner_time_zone: there is no zone {name!r}") from None
+        raise ConfigError(f"listener.scanner_time_zone: unknown time zone {name!r}") from None
 
 
 def open_scp(
@@ -211,7 +211,7 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         stack.callback(reception.close)
         reception.follow()
         if discarded:
-            text = f"{discarded} unanswered files of an earlier run"
+            text = f"{discarded} unanswered files from an earlier run"
             reception.alarm("unfinished_files", text)
         log.info("serving", port=scp.port, left_over=_requeue(reception, received))
         presence = stack.enter_context(Presence(cases.home, "listener"))
@@ -234,7 +234,7 @@ def _loop(
     while not stop.is_set():
         presence.beat()
         if not scp.is_listening:
-            raise ListeningEndedError("the thread that listens on the port has ended")
+            raise ListeningEndedError("the listening thread has ended")
         try:
             if reception.follow():
                 _requeue(reception, received)

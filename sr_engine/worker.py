@@ -152,7 +152,7 @@ def attempt(
     """As `measure`, unless this request has ended the worker again and again."""
     key = f"measurement {request.measurement_id}"
     if attempts.deaths(key) >= MOST_DEATHS:
-        text = f"the worker ended {attempts.deaths(key)} times while it was at this measurement"
+        text = f"the worker crashed {attempts.deaths(key)} times during this measurement"
         _fail(record, request.measurement_id, "worker_ended", text)
         attempts.forget(key)
         return
@@ -328,7 +328,7 @@ def localize_request(
     if not miss_px <= gate_px:
         raise OutsideGateError(
             f"the round object found is {miss_px * mean_mm:.1f} mm from where the fiducial is "
-            f"expected; at most {gate_px * mean_mm:.1f} mm are believed"
+            f"expected (limit {gate_px * mean_mm:.1f} mm)"
         )
     return found
 
@@ -409,8 +409,8 @@ def _common_geometry(slices: list[SliceRow]) -> SliceGeometry:
         if not same:
             raise UnusableSlicesError(
                 "geometry_changed",
-                f"slice {row.sop_instance_uid} does not lie where slice "
-                f"{slices[0].sop_instance_uid} of the same measurement lies",
+                f"slice {row.sop_instance_uid} is not at the same position as slice "
+                f"{slices[0].sop_instance_uid} of the same measurement",
             )
     return first
 

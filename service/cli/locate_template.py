@@ -93,8 +93,9 @@ def _refuse_unlike(header: Slice, like: Slice, name: str) -> None:
     """Another spacing or orientation shows the object otherwise: that takes another template."""
     here, there = geometry_of(header, Path(name)), geometry_of(like, Path(name))
     if not np.allclose(here.spacing_mm, there.spacing_mm, rtol=1e-3):
-        raise BadFileError(f"{name}: pixels of {here.spacing_mm} mm, the template's are "
-            f"{there.spacing_mm} mm")  # fmt: skip
+        raise BadFileError(
+            f"{name}: pixels of {here.spacing_mm} mm, the template's are {there.spacing_mm} mm"
+        )
     same = np.allclose(here.row_direction, there.row_direction, atol=1e-3) and np.allclose(
         here.col_direction, there.col_direction, atol=1e-3
     )

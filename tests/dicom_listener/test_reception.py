@@ -157,7 +157,7 @@ def test_nothing_of_another_patient_gets_in_before_the_case_is_bound_either(room
     room.send("berta", ImageOrientationPatient=[1, 0, 0, 0, 1, 0])  # axial: never used
     assert states(record) == []
     assert room.why_held() == ["no_slice_used_yet"]
-    assert "no slice of this case was used yet" in room.held.all()[0].reason
+    assert "no slice of this case has been used yet" in room.held.all()[0].reason
     room.send("anna", ImageOrientationPatient=[1, 0, 0, 0, 1, 0])
     room.send("anna")
     # what waited of her comes after, what waited of the other one stays where it is
@@ -243,9 +243,9 @@ def test_the_study_of_another_patient_is_never_taken_in(room):
     room.send("anna")
     room.send("berta")
     (study,) = room.held.studies()
-    with pytest.raises(TakingError, match="another patient"):
+    with pytest.raises(TakingError, match="a different patient"):
         take_study(record, room.cases.home, study.study, "Olga")
-    with pytest.raises(TakingError, match="nothing of the study"):
+    with pytest.raises(TakingError, match="no slices of study"):
         take_study(record, room.cases.home, "1.2.3.4", "Olga")
 
 

@@ -274,8 +274,8 @@ def test_what_waits_is_listed_and_of_another_patient_no_more_than_that_it_waits(
         assert {(one.study, one.description) for one in state.holding} == {
             ("1.2.1", "cor 0"), ("", "")}  # fmt: skip
         error = refusal(client.take_slices, "1.2.2")
-        assert "another patient" in str(error)
-        assert "nothing of the study" in str(refusal(client.take_slices, "1.2.77"))
+        assert "a different patient" in str(error)
+        assert "no slices of study" in str(refusal(client.take_slices, "1.2.77"))
 
 
 def test_another_service_in_the_same_room_is_refused(tmp_path):

@@ -334,7 +334,7 @@ def test_what_is_no_name_of_an_output_is_refused(name):
 
 
 def test_what_there_is_nothing_about_is_refused(record):
-    with pytest.raises(CaseRecordError, match="there is no measurement 99"):
+    with pytest.raises(CaseRecordError, match="no measurement 99"):
         make_output(record, Output("measurement", 99, "report"))
     with pytest.raises(CaseRecordError, match="procedure 99 did not reach READY"):
         make_output(record, Output("approach", 99, "report"))
