@@ -128,7 +128,7 @@ def _zone(name: str) -> ZoneInfo | None:
     try:
         return ZoneInfo(name)
     except (ZoneInfoNotFoundError, ValueError):
-        raise ConfigError(f"listener.scanner_time_zone: there is no zone {name!r}") from None
+        raise ConfigError(f"listener.scanner_time_zone: unknown time zone {name!r}") from None
 
 
 def open_scp(
@@ -213,7 +213,7 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         stack.callback(reception.close)
         reception.follow()
         if discarded:
-            text = f"{discarded} unanswered files of an earlier run"
+            text = f"{discarded} unanswered files from an earlier run"
             reception.alarm("unfinished_files", text)
         log.info("serving", port=scp.port, left_over=_requeue(reception, received))
         presence = stack.enter_context(Presence(cases.home, "listener"))
@@ -236,11 +236,11 @@ def _loop(
     while not stop.is_set():
         presence.beat()
         if not scp.is_listening:
-            raise ListeningEndedError("the thread that listens on the port has ended")
+            raise ListeningEndedError("the listening thread has ended")
         try:
             if reception.follow():
                 _requeue(reception, received)
-            _take_received(reception, received, attempts)
+            _take_received(reception, received, attempts, presence)
             reception.turn()
             for way_in in ways_in:
                 while way_in.alarms:
@@ -292,13 +292,16 @@ def _requeue(reception: Reception, received: "SimpleQueue[Path]") -> int:
     return len(left_over)
 
 
-def _take_received(reception: Reception, received: "SimpleQueue[Path]", attempts: Attempts) -> None:
+def _take_received(
+    reception: Reception, received: "SimpleQueue[Path]", attempts: Attempts, presence: Presence
+) -> None:
     """Wait for at most one poll, then take what is there; a flood does not stop the loop."""
     until_s = time.monotonic() + _TAKING_S
     try:
         path = received.get(timeout=_POLL_S)
         while True:
             _take(reception, path, attempts)
+            presence.beat()
             if time.monotonic() > until_s:
                 return
             path = received.get_nowait()

@@ -113,7 +113,7 @@ def _fiducials(
             for reception in receptions
         ]
     except EngineError as error:
-        raise CommissioningError(f"the fiducial is not seen in the slices: {error}") from None
+        raise CommissioningError(f"the fiducial was not found in the slices: {error}") from None
 
 
 def _start(

@@ -297,7 +297,7 @@ def test_slices_that_were_held_up_do_not_agree_and_are_not_believed():
         clock = after(clock, slice_, rules=MEASURED)
     unknown = clock.bounds_for(slice_, MEASURED)
     assert isinstance(unknown, OffsetUnknown)
-    assert "no 5 slices came as promptly as was measured at this site" in unknown.text
+    assert "no 5 slices arrived as promptly as was measured at this site" in unknown.text
 
 
 def test_with_comparison_and_promptness_an_acquisition_must_be_good_by_both():
@@ -307,7 +307,7 @@ def test_with_comparison_and_promptness_an_acquisition_must_be_good_by_both():
     assert bounds.low_s == pytest.approx(0.5 - 3.0)
     held_up = Received(acquired(1010.0), 1012.0 + 50.0)
     seen = observe(clock, held_up, MEASURED)
-    assert "no slice came later than 3.0 s when this was measured" in seen.unlike
+    assert "no slice arrived later than 3.0 s when this was measured" in seen.unlike
     # then it is the comparison alone that counts
     alone = seen.clock.bounds_for(held_up, MEASURED)
     assert alone.low_s == pytest.approx(-0.1, abs=0.1)
@@ -321,7 +321,7 @@ def test_a_slice_that_was_held_up_while_the_clock_was_set_back_is_not_taken_for_
     clock = after(ScannerClock(), held_up, *prompt, rules=MEASURED)
     assert isinstance(clock.bounds_for(prompt[-1], MEASURED), OffsetBounds)
     unknown = clock.bounds_for(held_up, MEASURED)
-    assert "no slice came later than 3.0 s when this was measured: scan again" in unknown.text
+    assert "no slice arrived later than 3.0 s when this was measured: scan again" in unknown.text
 
 
 def test_a_clock_set_forward_stops_everything_until_the_clocks_are_compared():

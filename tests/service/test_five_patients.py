@@ -92,7 +92,7 @@ def arm(page: Page, client: RoomClient) -> None:
         if (robot.armed and not robot.stopped and robot.position_certain) or state.question:
             return
         if robot.taken_um:
-            expect(page.locator("#next")).to_contain_text("are taken to stand at")
+            expect(page.locator("#next")).to_contain_text("Assumed stage positions")
         with contextlib.suppress(PlaywrightTimeoutError):  # the page was drawn anew meanwhile
             offered.click(timeout=2000)
         page.wait_for_timeout(200)
@@ -114,7 +114,7 @@ def go_through(page: Page, client: RoomClient, done) -> RoomState:
 def begin(page: Page, client: RoomClient, label: str) -> str:
     expect(page.locator("#new-label")).to_be_visible()
     page.locator("#new-label").fill(label)
-    press(page, "Begin the case")
+    press(page, "Start the case")
     state = until(client, lambda s: s.case_folder and s.case and s.case.label == label)
     expect(page.locator("#room")).to_contain_text(label)
     assert state.calibrated is False
