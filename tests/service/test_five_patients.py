@@ -125,7 +125,7 @@ def go_through(page: Page, client: RoomClient, done) -> RoomState:
 def begin(page: Page, client: RoomClient, label: str) -> str:
     expect(page.locator("#new-label")).to_be_visible()
     page.locator("#new-label").fill(label)
-    press(page, client, lambda s: s.case_folder, "Begin the case")
+    press(page, client, lambda s: s.case_folder, "Start the case")
     state = until(client, lambda s: s.case_folder and s.case and s.case.label == label)
     expect(page.locator("#room")).to_contain_text(label)
     assert state.calibrated is False
