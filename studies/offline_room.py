@@ -41,7 +41,8 @@ from simulator.scene import true_fiducial_mm
 from simulator.stage_physics import PiezoLegsStage, StageParameters
 from sr_engine.errors import EngineError
 from sr_engine.psf import Psf
-from sr_engine.worker import Frames, describe_result, localize_request
+from sr_engine.request import describe_result, localize_request
+from sr_engine.views import Frames, Templates, View
 
 Array = NDArray[np.float64]
 Result = TypeVar("Result")
@@ -172,6 +173,8 @@ class OfflineRoom:
         self._answer = answer or _agree
         self._slices: dict[int, list[SeenSlice]] = {1: []}
         self._measurements = 0
+        self._views: dict[int, View] = {}
+        self._templates = Templates()
 
     @property
     def stage_mm(self) -> dict[str, float]:
@@ -270,14 +273,19 @@ class OfflineRoom:
             geometry,
             tuple(one.row for one, _ in taken),
         )
+        views = [self._views[number] for number in step.template]
         try:
             request = measure_request(step, self._radius_mm, self._region_px)
-            found = localize_request(frames, step.method, request, self.imaging.psf)
+            found = localize_request(
+                frames, step.method, request, self.imaging.psf, views, self._templates
+            )
         except EngineError as error:
             return Measured(self._measurements, error.reason, str(error))
-        if step.method == "ml":
+        self._views[self._measurements] = View(self._measurements, frames, found.by.centre_px)
+        if found.by.method == "ml":
             doubt = np.eye(2) * self.imaging.model_sigma_px**2
-            found = replace(found, covariance_px2=found.covariance_px2 + doubt)
+            by = replace(found.by, covariance_px2=found.by.covariance_px2 + doubt)
+            found = replace(found, by=by)
         return measured_from_result(self._measurements, describe_result(frames, found))
 
 

@@ -31,7 +31,8 @@ from service.room.measuring import measure_request, measured_from_result
 from simulator.config import ScannerSettings
 from simulator.dicom_writer import AcquisitionStamp, Series, Study, write_mr_image
 from simulator.stage_physics import StageParameters
-from sr_engine.worker import is_at_position, measure
+from sr_engine.request import is_at_position
+from sr_engine.worker import measure
 from studies.offline_room import MrImaging, OfflineRoom
 
 _MOVE_S, _SLICE_S = 1.0, 0.5

@@ -44,6 +44,7 @@ def calibration_of(config: Config, travel: Mapping[str, Travel], seed: int) -> C
         move_um=move_um,
         shifts_px=_shifts_px(service.shift_set, seed),
         gate=gate_of(config),
+        localization=config.imaging.localization,
     )
 
 
