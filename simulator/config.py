@@ -92,6 +92,7 @@ class Fiducial(_Table):
         return self
 
 
+FiducialKind = Literal["cannulated", "sphere"]
 CANNULATED = {"oval": 1.06, "cannula_mm": 4.0}
 """What a printed fiducial that sits on a needle guide of brass is like, beside a plain sphere."""
 

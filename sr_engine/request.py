@@ -286,7 +286,8 @@ def _found_as_disc(
     refuse_non_square(frames.geometry.spacing_mm)
     mean_mm = float(np.mean(frames.geometry.spacing_mm))
     radius_px = _radius_px(frames, request)
-    expected_px, gate_px, region = None, math.inf, request.get("region_px")
+    expected_px, gate_px = None, math.inf
+    region: Sequence[float] | None = request.get("region_px")
     if request["expected_plane_mm"] is not None:
         expected_px = _expected_px(frames, request)
         gate_px = float(request["gate_mm"]) / mean_mm
@@ -295,7 +296,9 @@ def _found_as_disc(
     try:
         if expected_px is None:
             start_px = _start_anywhere(frames, method, radius_px, region)
-        elif gate_px > SEARCH_PX:  # the engine looks no further than that from a start
+        elif (
+            region is not None and gate_px > SEARCH_PX
+        ):  # the engine looks no further than that from a start
             start_px = _start_in_region(frames, radius_px, region)
         else:
             start_px = expected_px

@@ -47,6 +47,7 @@ from sr_engine.views import Frames, Templates, View
 Array = NDArray[np.float64]
 Result = TypeVar("Result")
 _DRIVE_HZ = 1000.0
+_CORRECTIONS, _CLOSE_UM = 6, 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,7 +139,8 @@ def _true_plane_mm(room: VirtualRoom, stage_mm: Mapping[str, float]) -> Array:
 
 
 class OfflineRoom:
-    """Motors without encoders, as in the default room: a readback is the count of the steps sent.
+    """Without encoders, as in the default room, a readback is the count of the steps sent; with
+    them, what they read.
 
     region_px: (r0, c0, r1, c1), where the fiducial is looked for while its place is not known;
     answer: what the operator says to a question; confirms by default, and never rescans.
@@ -220,11 +222,26 @@ class OfflineRoom:
             steps = change_um * self.nominal_mounting[axis] / self.nominal_step_um[axis]
             drive(self.stages[axis], steps)
             self.setpoints_um[axis] += change_um
+            if self.stages[axis].parameters.has_encoder and reached == 1.0:
+                self.setpoints_um[axis] = self._close_loop(axis, setpoint_um)
         hold_id = max(self._slices) + 1
         self._slices[hold_id] = []
         if reached < 1.0:
             return Moved("STOPPED", "stopped", "STOP", hold_id, dict(self.setpoints_um))
         return Moved("DONE", "", "", hold_id, dict(self.setpoints_um))
+
+    def _close_loop(self, axis: str, setpoint_um: int) -> int:
+        """Correct by what the encoder says; what it reads at the end."""
+        stage, mounting = self.stages[axis], self.nominal_mounting[axis]
+        read_um = 0.0
+        for _ in range(_CORRECTIONS):
+            read_um = mounting * (stage.read_encoder_um() or 0.0)
+            if abs(setpoint_um - read_um) <= _CLOSE_UM:
+                break
+            drive(stage, (setpoint_um - read_um) * mounting / self.nominal_step_um[axis])
+        else:
+            read_um = mounting * (stage.read_encoder_um() or 0.0)
+        return round(read_um)
 
     def _acquire(self, step: Acquire) -> Acquired:
         if step.fresh:

@@ -38,6 +38,7 @@ _ASYMMETRY_CHECK_SIGMA = 5.0
 # twice what the directions of an axis are taken to differ by: a stage that was driven into its stop
 # comes back further than it went out
 _LARGEST_ASYMMETRY = 0.10
+Templates = tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True)
@@ -58,26 +59,62 @@ class CalibrationArguments:
     localization: str = DISC
 
 
-@dataclass(frozen=True, eq=False)
-class Calibration:
-    """What later procedures start from.
+@dataclass(frozen=True)
+class FoundBy:
+    """How fiducials are found, and what all places found so have in common.
 
     templates: for each fiducial the measurements that its image is learnt from; none: a disc is
-    fitted. systematic_mm: std, for each coordinate of the estimate, of what is common to all places
-    found so; own_mm: of that, what the noise in the template's own measurements does.
+    fitted. systematic_mm: std, for each coordinate, of what is said to be the middle; own_mm: of
+    that, what the noise in the template's own measurements does.
     """
+
+    templates: tuple[tuple[int, ...], ...] = ()
+    systematic_mm: tuple[float, ...] = ()
+    own_mm: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, answers: Sequence[Measured], templates: Templates) -> FoundBy:
+        return cls(
+            templates,
+            tuple(x for answer in answers for x in answer.systematic_mm),
+            tuple(x for answer in answers for x in answer.own_mm),
+        )
+
+    def template_of(self, fiducial: int) -> tuple[int, ...]:
+        """The measurements that show one fiducial's image; empty where there is none."""
+        return self.templates[fiducial] if self.templates else ()
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "templates": [list(ids) for ids in self.templates],
+            "systematic_mm": list(self.systematic_mm),
+            "own_mm": list(self.own_mm),
+        }
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> FoundBy:
+        return cls(
+            tuple(tuple(ids) for ids in value["templates"]),
+            tuple(value["systematic_mm"]),
+            tuple(value["own_mm"]),
+        )
+
+
+BY_DISC = FoundBy()
+
+
+@dataclass(frozen=True, eq=False)
+class Calibration:
+    """What later procedures start from."""
 
     jacobian: ImageJacobian
     estimate: FiducialEstimate
     plane: ImagePlane
     measurement_id: int
-    templates: tuple[tuple[int, ...], ...] = ()
-    systematic_mm: tuple[float, ...] = ()
-    own_mm: tuple[float, ...] = ()
+    found_by: FoundBy = BY_DISC
 
     def template_of(self, fiducial: int = 0) -> tuple[int, ...]:
-        """The measurements that show one fiducial's image; empty where there is none."""
-        return self.templates[fiducial] if self.templates else ()
+        return self.found_by.template_of(fiducial)
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -85,9 +122,7 @@ class Calibration:
             "estimate": self.estimate.to_json(),
             "plane": self.plane.to_json(),
             "measurement_id": self.measurement_id,
-            "templates": [list(ids) for ids in self.templates],
-            "systematic_mm": list(self.systematic_mm),
-            "own_mm": list(self.own_mm),
+            "found_by": self.found_by.to_json(),
         }
 
     @classmethod
@@ -97,9 +132,7 @@ class Calibration:
             FiducialEstimate.from_json(value["estimate"]),
             ImagePlane.from_json(value["plane"]),
             value["measurement_id"],
-            tuple(tuple(ids) for ids in value.get("templates", ())),
-            tuple(value.get("systematic_mm", ())),
-            tuple(value.get("own_mm", ())),
+            FoundBy.from_json(value["found_by"]) if "found_by" in value else BY_DISC,
         )
 
 
@@ -145,7 +178,6 @@ class OneSeen:
 SeenThere = TypeVar("SeenThere", bound=Seen)
 # of the place before and, where there is one, of the prediction for this place
 LookThere = Callable[[FiducialEstimate | None, FiducialEstimate | None], ProcedureSteps[SeenThere]]
-Templates = tuple[tuple[int, ...], ...]
 # at what was seen last, expected there, by the measurements that show each fiducial
 LookByTemplate = Callable[
     [SeenThere, FiducialEstimate, Templates], ProcedureSteps[tuple[Measured, ...]]
@@ -273,16 +305,8 @@ def _as_templates_find(
                 block_diag(*(view.covariance_mm2 for view in views)),
             )
         )
-    return (
-        replace(
-            known,
-            measurement_id=newest,
-            templates=templates,
-            systematic_mm=tuple(x for answer in answers for x in answer.systematic_mm),
-            own_mm=tuple(x for answer in answers for x in answer.own_mm),
-        ),
-        found,
-    )
+    found_by = FoundBy.of(answers, templates)
+    return replace(known, measurement_id=newest, found_by=found_by), found
 
 
 def _check_there_and_back(

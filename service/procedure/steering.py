@@ -38,7 +38,8 @@ class SteeringArguments:
     target_mm: in the image plane of the calibration, as the estimate has it. travel_um: lowest and
     highest setpoint of each axis. most_frames: slices at one position at the most. proven: what is
     measured was seen to move with the robot, see `identity`; otherwise READY is said only after a
-    move that shows it.
+    move that shows it. systematic_mm: std, for each coordinate, of what all places found so have in
+    common, where it counts: see `targets.common_part_mm`.
     """
 
     target_mm: tuple[float, ...]
@@ -50,6 +51,14 @@ class SteeringArguments:
     gate: ValidationGate
     proven: bool = True
     most_frames: int = 6
+    systematic_mm: tuple[float, ...] = ()
+
+    def as_judged(self, estimate: FiducialEstimate) -> FiducialEstimate:
+        """An estimate with what counts against the target beside its own uncertainty."""
+        if not self.systematic_mm:
+            return estimate
+        more = np.diag(np.square(self.systematic_mm))
+        return replace(estimate, covariance_mm2=estimate.covariance_mm2 + more)
 
     @property
     def travel(self) -> dict[str, Travel]:
