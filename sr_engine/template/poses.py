@@ -18,8 +18,7 @@ from sr_engine.template.learn import Template, learn_template
 
 Array = NDArray[np.float64]
 
-ROUGH_PX = 0.5  # how far a place may be off, that the frames are begun with
-_ROUNDS = 3
+_DOUBTS_PX = (0.5, 0.0)  # of the places that each round begins with
 _MOST_MOVED_PX = 2.0  # from where a place was said to be
 _SEARCHED_PX = 1.0  # from farther away than this the template is looked for
 
@@ -36,7 +35,7 @@ def learn_from_places(
     stack = checked_frames(frames)
     places = checked_shifts(places_px, len(stack))
     start = places
-    for doubt_px in (ROUGH_PX, *(_ROUNDS - 1) * (0.05,)):
+    for doubt_px in _DOUBTS_PX:
         template = learn_template(
             stack,
             places - places[0],
