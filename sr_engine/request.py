@@ -276,7 +276,7 @@ def _refuse_outside(
     if not miss_px <= gate_px:
         raise OutsideGateError(
             f"the object found is {miss_px * mean_mm:.1f} mm from where the fiducial is "
-            f"expected; at most {gate_px * mean_mm:.1f} mm are believed"
+            f"expected (limit {gate_px * mean_mm:.1f} mm)"
         )
 
 
@@ -433,7 +433,7 @@ def common_geometry(slices: list[SliceRow]) -> SliceGeometry:
         if not same:
             raise UnusableSlicesError(
                 "geometry_changed",
-                f"slice {row.sop_instance_uid} does not lie where slice "
-                f"{slices[0].sop_instance_uid} of the same measurement lies",
+                f"slice {row.sop_instance_uid} is not at the same position as slice "
+                f"{slices[0].sop_instance_uid} of the same measurement",
             )
     return first

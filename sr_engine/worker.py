@@ -7,11 +7,14 @@ is recorded as failed, with the reason.
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import io
 import sqlite3
 import time
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import structlog
@@ -110,7 +113,7 @@ def attempt(
     """As `measure`, unless this request has ended the worker again and again."""
     key = f"measurement {request.measurement_id}"
     if attempts.deaths(key) >= MOST_DEATHS:
-        text = f"the worker ended {attempts.deaths(key)} times while it was at this measurement"
+        text = f"the worker crashed {attempts.deaths(key)} times during this measurement"
         _fail(record, request.measurement_id, "worker_ended", text)
         attempts.forget(key)
         return
@@ -132,7 +135,7 @@ def measure(
         psf = known.psfs.of(frames)
         result = describe_result(frames, localize_as_asked(record, request, frames, psf, known))
         result["point_spread"] = asdict(psf)
-        result["reconstruction"] = _reconstruction(record.case_dir, number, frames, factor)
+        result |= _reconstruction(record.case_dir, number, frames, factor)
         json_text(result)  # NaN, or a value of no known type, is found here and not in the record
     except (EngineError, UnusableSlicesError, UnusableError) as error:
         _fail(record, number, _code_of(error), str(error))
@@ -235,19 +238,23 @@ def _code_of(error: EngineError | UnusableSlicesError | UnusableError) -> str:
     return str(error.reason)
 
 
-def _reconstruction(case_dir: Path, number: int, frames: Frames, factor: int) -> str | None:
-    """Write the super-resolution image as .npy beside the record; None where there is none."""
+def _reconstruction(case_dir: Path, number: int, frames: Frames, factor: int) -> dict[str, Any]:
+    """Write the super-resolution image as .npy beside the record; its name (None where there is no
+    image), and what the file is sworn to be.
+    """
     if len(frames.pixels) < factor**2:
-        return None
+        return {"reconstruction": None}
     try:
         made = reconstruct(frames.pixels, frames.shifts_px, factor=factor, method="fourier")
     except SingularShiftSetError:
-        return None  # slices at one place only: nothing finer to show
+        return {"reconstruction": None}  # slices at one place only: nothing finer to show
     folder = case_dir / IMAGES
     folder.mkdir(exist_ok=True)
     path = folder / f"measurement-{number}.npy"
     temporary = path.with_suffix(".part")
-    with temporary.open("wb") as file:
-        np.save(file, made.image.astype(np.float32))
+    buffer = io.BytesIO()
+    np.save(buffer, made.image.astype(np.float32))
+    temporary.write_bytes(buffer.getvalue())
     temporary.replace(path)
-    return f"{IMAGES}/{path.name}"
+    digest = hashlib.sha256(buffer.getvalue()).hexdigest()
+    return {"reconstruction": f"{IMAGES}/{path.name}", "reconstruction_sha256": digest}

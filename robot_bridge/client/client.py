@@ -260,7 +260,9 @@ class BridgeClient:
 
     def _refuse_while_stopping(self) -> None:
         if self._stopper.pending:
-            raise RefusedError(Code.STOP_LATCHED, "a STOP is under way; re-arm after it arrived")
+            raise RefusedError(
+                Code.STOP_LATCHED, "a STOP is on its way; re-arm once it has arrived"
+            )
 
 
 def _checked_um(positions_um: Mapping[str, int]) -> dict[str, int]:

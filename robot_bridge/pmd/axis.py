@@ -54,8 +54,8 @@ def agrees(moved_um: float, distance_um: float) -> bool:
 
 def disagreement(moved_um: float, distance_um: float) -> str:
     return (
-        f"the motor went {distance_um:+.0f} um by its steps and the encoder {moved_um:+.0f} um: "
-        "encoder, its direction, counts_per_mm or the step lengths are wrong"
+        f"the motor moved {distance_um:+.0f} um by its steps but {moved_um:+.0f} um by the "
+        "encoder: the encoder, its direction, counts_per_mm or the step lengths are wrong"
     )
 
 
@@ -182,7 +182,7 @@ class PmdAxis(PmdController):
         try:
             yield from self._go(pmd_protocol.move_to_count(self.address, target, self.speed_hz))
         except PmdNoValueError:  # no echo: what it does is seen below, and a target is absolute
-            self.doubts["T"] = "a motion is not confirmed by an echo"
+            self.doubts["T"] = "the echo does not confirm the motion"
         watch = _ProgressWatch(self, abs(setpoint_um - self.position_um), self.clock())
         try:
             yield from self._follow(setpoint_um, watch)
@@ -306,12 +306,14 @@ class PmdAxis(PmdController):
             if not status & Status.RUNNING and (yield from self.ask("J")).integer() == 0:
                 return
             if self.clock() > deadline_s:
-                raise self.error("motion_timeout", f"runs longer than {run.duration_s:.1f} s")
+                raise self.error("motion_timeout", f"still running after {run.duration_s:.1f} s")
             yield Pause(POLL_PAUSE_S)
 
     def _microstep_phase(self) -> Steps[int | None]:
         """None if the board does not tell; the end of a run is then known by its status alone."""
-        reply = yield from self.ask_if_it_can("Y0", "a run's length cannot be checked afterwards")
+        reply = yield from self.ask_if_it_can(
+            "Y0", "the length of a run cannot be checked afterwards"
+        )
         if reply is None:
             return None
         values = reply.integers()
@@ -394,9 +396,11 @@ class _ProgressWatch:
             self._best_um, self._best_s, self._looks = error_um, now_s, 0
         if self.is_away(error_um):
             self._axis.certain = False
-            raise self._axis.error("runaway", f"moves away, {error_um:.0f} um from the setpoint")
+            raise self._axis.error(
+                "runaway", f"is moving away, {error_um:.0f} um from the setpoint"
+            )
         far = error_um > self._far_um and self._looks >= LOOKS_MIN
         window_s = (FAR_WINDOW_S if far else STALL_WINDOW_S) + self._resolution_s
         if now_s - self._best_s > window_s:
             self._axis.certain = False
-            raise self._axis.error("stalled", f"stands {error_um:.0f} um from the setpoint")
+            raise self._axis.error("stalled", f"stalled {error_um:.0f} um from the setpoint")

@@ -47,7 +47,7 @@ def same_addresses(axes: Sequence[AxisConfig]) -> list[str]:
             if alike and None in (axis.serial_number, other.serial_number):
                 said.append(
                     f"axes {axis.name} and {other.name} have the same address {axis.address} on "
-                    "two ports: give each its serial_number, and name ports by /dev/serial/by-id"
+                    "two ports: give each its serial_number and name the ports by /dev/serial/by-id"
                 )
     return said
 

@@ -234,11 +234,11 @@ class PmdController:
         if self.clock() < self._supply_due_s:
             return
         self._supply_due_s = self.clock() + SUPPLY_PERIOD_S
-        reply = yield from self.ask_if_it_can("U2", "supply and temperature are not known")
+        reply = yield from self.ask_if_it_can("U2", "supply and temperature are unknown")
         try:
             self.supply = parse_supply(reply.value) if reply else None
         except PmdError:
-            self.doubts["U2"] = "supply and temperature are not understood"
+            self.doubts["U2"] = "cannot parse supply and temperature"
 
     @property
     def _drift_um(self) -> float:
@@ -260,13 +260,13 @@ class PmdController:
     def read_speed_cap(self) -> Steps[None]:
         """What the motor's capacitance allows; the controller measures it while it unparks."""
         self.speed_cap_hz = self.model_max_hz
-        reply = yield from self.ask_if_it_can("U3", "the drive limit of the motor is not known")
+        reply = yield from self.ask_if_it_can("U3", "the motor's drive limit is unknown")
         if reply is None:
             return
         try:
             cap_hz = parse_drive(reply.value).max_frequency_hz
         except PmdError:
-            self.doubts["U3"] = f"the drive limit '{reply.value}' is not understood"
+            self.doubts["U3"] = f"cannot parse drive limit '{reply.value}'"
             return
         if cap_hz > 0:
             self.speed_cap_hz = min(self.model_max_hz, cap_hz)

@@ -32,7 +32,7 @@ from robot_bridge.pmd.stop import confirm_stops
 
 log = logging.getLogger(__name__)
 
-UNTRIED = "PMD401/PMD301 driver: not tried on hardware; do the first-unit checks of bring_up.md"
+UNTRIED = "PMD401/PMD301 driver: never tested on hardware; do the first-unit checks in bring_up.md"
 POLL_BUDGET_S = 0.02
 INITIALISE_DEADLINE_S = 10.0
 DECLARE_DEADLINE_S = 2.0
@@ -210,7 +210,9 @@ class PmdMotors:
         axes = {name: self._axis(name) for name in positions_um}
         for name, position_um in positions_um.items():
             if not isinstance(position_um, int):
-                raise MotorError("bad_position", f"axis {name}: {position_um!r} um is no integer")
+                raise MotorError(
+                    "bad_position", f"axis {name}: {position_um!r} um is not an integer"
+                )
         self._begin({})
         deadline_s = self._clock() + DECLARE_DEADLINE_S
         for name, axis in axes.items():
@@ -236,7 +238,7 @@ class PmdMotors:
         if self._reconnect_s is not None:
             raise MotorError(*(self._fault or ("port_failed", "a controller port is lost")))
         if self._motion:
-            raise MotorError("moving", "a motion is under way")
+            raise MotorError("moving", "a motion is in progress")
 
     def _axis(self, name: str) -> PmdAxis:
         if name not in self._axes:
@@ -383,7 +385,7 @@ class PmdMotors:
         if failed:
             self._lose_port(failed[1], failed[0])
         elif not self._other:
-            log.warning("the controllers answer again; declare the position, or home")
+            log.warning("the controllers answer again; declare the position or home")
             for axis in self._axes.values():
                 axis.fault = None
             self._fault, self._reconnect_s = None, None

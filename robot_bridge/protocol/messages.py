@@ -340,7 +340,7 @@ def _boolean(value: Any) -> bool:
 
 def _text(value: Any) -> str:
     if type(value) is not str or len(value) > TEXT_MAX:
-        raise MessageError(f"{str(value)[:40]!r} is not a text of at most {TEXT_MAX} characters")
+        raise MessageError(f"{str(value)[:40]!r} is not text of at most {TEXT_MAX} characters")
     return value
 
 

@@ -114,7 +114,7 @@ def finding_of_arrival(record: CaseRecord, procedure_id: int) -> Finding:
     known = (row for row in record.procedures() if row.procedure_id == procedure_id)
     arrival = next(known, None)
     if arrival is None or arrival.name not in APPROACHES or arrival.state != "done":
-        raise CaseRecordError(f"{record.case_dir}: procedure {procedure_id} did not come to READY")
+        raise CaseRecordError(f"{record.case_dir}: procedure {procedure_id} did not reach READY")
     result = arrival.result or {}
     found = finding_of_measurement(record, int(result["measurement_id"]))
     distance = Distance(
@@ -134,7 +134,7 @@ def finding_of_puncture(record: CaseRecord, event_id: int) -> Finding:
     known = (event for event in record.events_of_kind("puncture") if event.event_id == event_id)
     puncture = next(known, None)
     if puncture is None:
-        raise CaseRecordError(f"{record.case_dir}: event {event_id} is no puncture")
+        raise CaseRecordError(f"{record.case_dir}: event {event_id} is not a puncture")
     found = finding_of_arrival(record, int(puncture.body["procedure_id"]))
     return Finding(**{**vars(found), "puncture": puncture})
 

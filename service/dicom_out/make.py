@@ -18,6 +18,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from case_record.connection import is_older
 from case_record.record import CaseRecord, CaseRecordError
 from service.dicom_out.errors import OutputError
 from service.procedure.registry import APPROACHES
@@ -56,7 +57,9 @@ def output_of(name: str) -> Output:
     """Raises OutputError for what is no name of an output."""
     found = _NAME.fullmatch(name)
     if found is None:
-        raise OutputError(f"{name!r} is no output: SUBJECT-NUMBER-KIND is, as approach-5-report")
+        raise OutputError(
+            f"{name!r} is not an output; expected SUBJECT-NUMBER-KIND, such as approach-5-report"
+        )
     subject, number, kind = found.groups()
     return Output(subject, int(number), kind)  # type: ignore[arg-type]
 
@@ -81,10 +84,12 @@ def outputs_to_send(record: CaseRecord, after_measurement: int = 0) -> Iterator[
 def make_output(record: CaseRecord, output: Output) -> Path:
     """Return the file of the output, made now unless it lies there; durable when this returns.
 
-    Raises OutputError, CaseRecordError, OSError.
+    The record swears to what was made; what it does not swear to is made again. Raises OutputError,
+    CaseRecordError (TamperedError for a file that was changed), OSError.
     """
     path = output.path(record.case_dir)
-    if path.is_file():
+    name = str(path.relative_to(record.case_dir))
+    if path.is_file() and record.is_sealed(name):
         return path
     buffer = io.BytesIO()
     try:
@@ -97,7 +102,9 @@ def make_output(record: CaseRecord, output: Output) -> Path:
     except (AttributeError, TypeError, ValueError) as error:
         # so highdicom and pydicom say that a source's header cannot be used
         raise OutputError(f"{output.name}: {error}") from error
-    _write_once(path, buffer.getvalue())
+    if not record.read_only:
+        record.seal_file(name, buffer.getvalue())
+    _write(path, buffer.getvalue())
     return path
 
 
@@ -131,21 +138,19 @@ def _finding(record: CaseRecord, output: Output) -> Finding:
     return find(record, output.number)
 
 
-def _write_once(path: Path, content: bytes) -> None:
-    """Whoever comes first with a file of this name wins; it is whole and on disk, or not there."""
-    path.parent.mkdir(exist_ok=True)
+def _write(path: Path, content: bytes) -> None:
+    """Whole and on disk, or not there; who comes at the same time writes the same."""
+    path.parent.mkdir(exist_ok=True, mode=0o700)
     number, part = tempfile.mkstemp(prefix=f"{path.stem}-", suffix=".part", dir=path.parent)
     try:
         with os.fdopen(number, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        try:
-            os.link(part, path)
-        except FileExistsError:
-            return
-    finally:
+        os.replace(part, path)
+    except BaseException:
         os.unlink(part)
+        raise
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)
@@ -157,7 +162,7 @@ def main(words: list[str]) -> int:
     """Make one output; the last line on standard error says why not."""
     case_dir, name = words
     try:
-        with CaseRecord(Path(case_dir), read_only=True) as record:
+        with CaseRecord(Path(case_dir), read_only=is_older(Path(case_dir))) as record:
             print(make_output(record, output_of(name)))
     except (OutputError, CaseRecordError, OSError) as error:
         print(error, file=sys.stderr)

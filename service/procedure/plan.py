@@ -106,13 +106,13 @@ def why_void(
         at_um = positions_um.get(axis)
         if at_um is None or not abs(at_um - planned_um) <= SAME_PLACE_UM:
             return (
-                f"the plan was made where axis {axis} stood at {planned_um / 1000:.3f} mm, now it "
-                f"stands at {'nowhere known' if at_um is None else f'{at_um / 1000:.3f} mm'}"
+                f"the plan was made with axis {axis} at {planned_um / 1000:.3f} mm; it is "
+                f"now at {'an unknown position' if at_um is None else f'{at_um / 1000:.3f} mm'}"
             )
     newer = rests_on is not None and (newest_measurement_id or 0) > rests_on
     if newer:
         return (
-            f"the plan rests on measurement {rests_on}, there is a newer one "
+            f"the plan rests on measurement {rests_on}; there is a newer one "
             f"({newest_measurement_id})"
         )
     return ""

@@ -90,7 +90,9 @@ def move(step: MoveTo) -> ProcedureSteps[Moved]:
         return moved
     if moved.state == "REFUSED":
         raise ProcedureFailedError(moved.code, f"the robot did not move: {moved.text}")
-    text = f"the robot was stopped on its way ({moved.text}): look where it stands, then start anew"
+    text = (
+        f"the robot was stopped during the move ({moved.text}): check where it is, then start again"
+    )
     raise ProcedureFailedError(moved.code, text)
 
 
@@ -282,8 +284,8 @@ def check_prediction(
         listed = ", ".join(f"{value:+.3f}" for value in miss)
         raise ProcedureFailedError(
             "prediction_missed",
-            f"the fiducial is ({listed}) mm (row, col) from where the move should have brought "
-            f"it, {sigmas:.1f} σ (allowed {allowed:.1f}, repeatability "
+            f"the fiducial is ({listed}) mm (row, col) from where the move should have taken it, "
+            f"{sigmas:.1f} σ (allowed {allowed:.1f}, repeatability "
             f"{gate.repeatability_mm * 1000:.0f} µm): calibrate again",
         )
 

@@ -84,7 +84,7 @@ class Room:
         configured = self.config.service.guide
         if guide and configured is None:
             raise ConflictError(
-                "no_guide", "This room has no [service.guide] table: it steers two axes only."
+                "no_guide", "This room has no [service.guide] table: it controls two axes only."
             )
         return configured if guide or guide is None else None
 
@@ -103,7 +103,7 @@ class Room:
         if calibration is None:
             raise ConflictError(
                 "not_calibrated",
-                "Calibrate first (a new frame of reference voids the calibration before).",
+                "Calibrate first (a new frame of reference voids any earlier calibration).",
             )
         status = self.linked()
         noise = gate_of(self.config).noise

@@ -51,7 +51,7 @@ class RoomMetrics(Collector):
         )
         passed_over = GaugeMetricFamily(
             "autospine_openigtlink_passed_over",
-            "Messages of peers that were not heeded.",
+            "Messages from peers that were ignored.",
             labels=["reason"],
         )
         for reason, count in (

@@ -211,7 +211,7 @@ def test_a_confirmation_that_comes_second_is_refused_and_says_why(
     page.locator("#confirm").click()
     wait_for(client.state, lambda s: s.question is None)
     second.evaluate("window.hang.click()")
-    expect(second.locator("#refusal")).to_contain_text("not open any more")
+    expect(second.locator("#refusal")).to_contain_text("no longer open")
     second.close()
     assert sum(event.kind == "answered" for event in client.events(after=asked_at)) == 1
     stop_all(client)
@@ -229,7 +229,7 @@ def test_a_viewer_sees_everything_and_can_move_nothing(browser: Browser, tmp_pat
         assert not serious_violations(page)
         page.locator("#token").fill("wrong")
         button(page, "Log in")
-        expect(page.locator("#login-refusal")).to_contain_text("not known")
+        expect(page.locator("#login-refusal")).to_contain_text("Unknown or expired")
         page.locator("#token").fill(viewer)
         button(page, "Log in")
         expect(page.locator("#who")).to_have_text("Vera (viewer)")

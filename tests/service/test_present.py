@@ -398,24 +398,64 @@ def test_another_study_voids_the_target_and_not_the_calibration(room):
     assert refused.value.code == "target_void"
 
 
-def test_another_patients_slices_void_nothing(room):
+def another_patient_in_the_case(room):
+    """Where the room has this case only: whatever arrives is recorded in it."""
+    header = {**room.header, "study_instance_uid": "9.9"}
+    room.do(lambda: room._add_slice(None, header, reason_code="other_patient"))
+
+
+def held(room, **body):
+    room.do(lambda: room.loop._record.append_event("slice_held", body, source="listener"))
+
+
+@pytest.mark.parametrize(
+    "comes",
+    [
+        another_patient_in_the_case,
+        lambda room: held(room, code="other_patient"),
+        lambda room: held(room, code="other_study"),
+        lambda room: held(room, code="other_case", same_patient=True),
+    ],
+    ids=["patient aside", "patient held", "study held", "earlier case of this patient"],
+)
+def test_slices_that_are_not_the_cases_own_take_back_ready(room, comes):
+    """Somebody else may lie on the table, or the patient lies on it anew: that is looked at."""
+    target = room.ready().target_patient_mm
+    comes(room)
+    state = room.until(lambda s: s.ready_lost)
+    assert state.ready_lost.code == "other_place"
+    assert state.error is None
+    with pytest.raises(ConflictError):
+        room.call("puncture")
+    # not this case's: neither target nor calibration rests on them
+    assert room.until(lambda s: s.ready_lost).target_patient_mm == target
+    room.call("needle_out")
+    room.ready(-1.0, 0.5)
+
+
+def test_what_is_pushed_late_of_another_patients_earlier_case_takes_back_nothing(room):
     room.ready()
-    room.do(
-        lambda: room._add_slice(
-            None, {**room.header, "study_instance_uid": "9.9"}, reason_code="other_patient"
-        )
-    )
+    held(room, code="other_case", same_patient=False)
     assert room.later().ready
 
 
-def test_a_study_that_waits_outside_of_the_case_takes_back_ready(room):
-    room.ready()
-    room.do(
-        lambda: room.loop._record.append_event(
-            "slice_held", {"code": "other_study"}, source="listener"
-        )
-    )
-    assert room.until(lambda s: s.ready_lost).ready_lost.code == "other_place"
+def test_slices_of_another_frame_between_the_look_and_its_measurement_count_too(room):
+    room.calibrate()
+    room.call("set_target", patient_mm=patient_mm(41.0, 58.0))
+    record, header = room.loop._record, {**room.header, "frame_of_reference_uid": "1.2.8"}
+    request = record.request_measurement
+
+    def table_moves_first(*asked):
+        room._add_slice(None, header, reason_code="other_frame_of_reference")
+        return request(*asked)
+
+    room.do(lambda: setattr(record, "request_measurement", table_moves_first))
+    room.call("start_approach")
+    state = room.run_to_end()
+    assert "approach done" in state.last_outcome
+    state = room.later()
+    assert not state.ready
+    assert state.measurement.lost.code == "other_place"
 
 
 @pytest.mark.parametrize(
@@ -459,7 +499,7 @@ def test_slices_of_another_protocol_end_the_approach_that_was_begun_without_them
     room.do(lambda: room.header.update(pixel_bandwidth_hz=250.0))
     room.call("start_approach")
     state = room.run_to_end()
-    assert "another pixel bandwidth (250 instead of 500)" in state.last_outcome
+    assert "a different pixel bandwidth (250 instead of 500)" in state.last_outcome
     assert not state.ready
 
 
