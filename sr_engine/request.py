@@ -253,7 +253,7 @@ def _found_by_template(frames: Frames, request: Mapping[str, Any], learnt: Learn
             gate_px=gate_px,
             shift_sigma_px=shift_sigma_px,
         )
-    except (TemplateMismatchError, NoRoundObjectError) as error:
+    except (TemplateMismatchError, NoRoundObjectError, NotConvergedError) as error:
         raise TemplateMismatchError(
             f"{error}: the fiducial does not look as in the slices of the calibration. Take the "
             "slice again; if it stays so (a bubble has moved, the slice lies elsewhere), calibrate "
