@@ -1,4 +1,4 @@
-"""Steering by the fiducial's own image: an oval fiducial with a cannula's void, which is no disc."""
+"""Steering by the fiducial's own image: an oval one with a cannula's void, which is no disc."""
 
 from dataclasses import replace
 
@@ -46,7 +46,9 @@ def test_what_is_no_disc_is_calibrated_steered_and_placed_truly():
         there = room.run(record_place(RecordingArguments("adaptive", 0.012, GATE), start))
         first_mm, target_mm = room.true_plane_mm, there.calibration.estimate.plane_mm
         assert np.array_equal(before, first_mm)
-        away = room.run(approach(approach_arguments(target_mm + [3.4, -2.2]), there.calibration))
+        away = room.run(
+            approach(approach_arguments(beside(there.calibration, 3.4, -2.2)), there.calibration)
+        )
         back = room.run(approach(approach_arguments(target_mm), away.calibration))
         misses.append(room.true_plane_mm - first_mm)
         sigmas.append(back.sigma_mm)
@@ -125,7 +127,8 @@ def test_another_thing_in_its_place_is_refused_by_name_with_what_to_do():
         VirtualRoom(fiducials=(Fiducial(radius_mm=5.5, cannula_mm=9.0),), protocol=PROTOCOL)
     )
     with pytest.raises(ProcedureFailedError, match="calibrate again") as refused:
-        room.run(measure_here("ml", GATE.around(start.estimate), template=start.template_of()))
+        expected, template = GATE.around(start.estimate), start.template_of()
+        room.run(measure_here("ml", expected, fresh=True, template=template))
     assert refused.value.code == "template-mismatch"
 
 
