@@ -126,8 +126,8 @@ def test_another_thing_in_its_place_is_refused_by_name_with_what_to_do():
     room.imaging = MrImaging(
         VirtualRoom(fiducials=(Fiducial(radius_mm=5.5, cannula_mm=9.0),), protocol=PROTOCOL)
     )
+    expected, template = GATE.around(start.estimate), start.template_of()
     with pytest.raises(ProcedureFailedError, match="calibrate again") as refused:
-        expected, template = GATE.around(start.estimate), start.template_of()
         room.run(measure_here("ml", expected, fresh=True, template=template))
     assert refused.value.code == "template-mismatch"
 
