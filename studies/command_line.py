@@ -145,8 +145,8 @@ def _run_navigation(
         files = navigation_report.write_csv(study, out)
         files += navigation_report.draw_punctures(study, out)
     if as_json:
-        settings = {"trials": trials, "seed": seed, "snr": snr, "step_scatter": step_scatter}
-        settings |= {"fiducial": fiducial, "encoders": encoders}
+        settings: dict[str, object] = {"trials": trials, "seed": seed, "snr": snr}
+        settings |= {"step_scatter": step_scatter, "fiducial": fiducial, "encoders": encoders}
         typer.echo(json.dumps(navigation_report.as_json(study, settings, files), allow_nan=False))
         return
     console = Console()

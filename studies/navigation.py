@@ -205,7 +205,7 @@ def _go_away(
 
 def _room(group: Group) -> OfflineRoom:
     seconds = IMAGE_MINUTES[group.setup] * 60.0
-    fiducial = Fiducial(**FIDUCIALS[group.fiducial])
+    fiducial = Fiducial.model_validate(FIDUCIALS[group.fiducial])
     room = VirtualRoom(protocol=SliceProtocol(snr=group.snr), fiducials=(fiducial,))
     imaging: MrImaging | CameraImaging = MrImaging(room, frame_s=seconds)
     if group.setup == "benchtop":
