@@ -65,6 +65,23 @@ class SteeringArguments:
         return {axis: Travel(low, high) for axis, (low, high) in self.travel_um.items()}
 
 
+def why_never_sure(
+    arguments: SteeringArguments, is_sure: Callable[[FiducialEstimate], bool]
+) -> str:
+    """Why READY could not be said even at the target, seen perfectly; empty where it could."""
+    size = len(arguments.target_mm)
+    there = FiducialEstimate({}, np.array(arguments.target_mm), np.zeros((size, size)))
+    if is_sure(there):
+        return ""
+    worst_mm = max(arguments.systematic_mm, default=0.0)
+    return (
+        f"where the middle of the fiducial is, is known to {worst_mm:.3f} mm (σ, one axis), and for "
+        f"this target that counts in full: an error below {arguments.tolerance_mm:g} mm cannot be "
+        f"said with {100 * arguments.confidence:g} %. Widen the tolerance, or record a target at "
+        "the fiducial's own place"
+    )
+
+
 class AnyLook(Protocol):
     """What was seen from where the robot stands now.
 

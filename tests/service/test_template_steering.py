@@ -8,13 +8,14 @@ from offline_arguments import GATE, approach_arguments, beside, calibration_argu
 
 from case_record.record import CaseRecord
 from service.cli.replay import replay_measurements, replay_procedure
-from service.procedure.approach import approach
+from service.procedure.approach import SteeredFiducial, approach
 from service.procedure.calibration import BY_DISC, FoundBy, calibrate
 from service.procedure.recording import RecordingArguments, record_place
 from service.procedure.registry import APPROACH, CALIBRATION
 from service.procedure.registry import approach_arguments as recorded_approach
 from service.procedure.registry import calibration_arguments as recorded_calibration
 from service.procedure.sensing import ProcedureFailedError, measure_here
+from service.procedure.steering import why_never_sure
 from service.procedure.targets import Target, common_part_mm
 from simulator.config import CANNULATED, Fiducial, SliceProtocol, VirtualRoom
 from simulator.stage_physics import StageParameters
@@ -144,3 +145,7 @@ def test_of_the_absolute_centre_counts_what_the_targets_kind_says():
     told = approach_arguments((0.0, 0.0), systematic_mm=(0.03, 0.04))
     judged = told.as_judged(start.estimate).covariance_mm2 - start.estimate.covariance_mm2
     assert np.allclose(judged, np.diag([0.0009, 0.0016]))
+    # 0.06 mm cannot be said of a place in tissue with that, 0.1 mm can
+    assert "known to 0.040 mm" in why_never_sure(told, SteeredFiducial(told).is_sure)
+    wider = replace(told, tolerance_mm=0.1)
+    assert why_never_sure(wider, SteeredFiducial(wider).is_sure) == ""
