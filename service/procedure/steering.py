@@ -75,8 +75,8 @@ def why_never_sure(
         return ""
     worst_mm = max(arguments.systematic_mm, default=0.0)
     return (
-        f"where the middle of the fiducial is, is known to {worst_mm:.3f} mm (σ, one axis), and for "
-        f"this target that counts in full: an error below {arguments.tolerance_mm:g} mm cannot be "
+        f"the middle of the fiducial is known to {worst_mm:.3f} mm (σ, one axis), and for this "
+        f"target that counts in full: an error below {arguments.tolerance_mm:g} mm cannot be "
         f"said with {100 * arguments.confidence:g} %. Widen the tolerance, or record a target at "
         "the fiducial's own place"
     )
