@@ -46,7 +46,7 @@ def measured_from_result(measurement_id: int, result: Mapping[str, Any]) -> Meas
         plane=result["plane"],
         frames=result["n_frames"],
         scan_s=result["scan_s"],
-        method=result["method"],
+        method=result.get("method", ""),
         systematic_mm=_pair(result.get("systematic_mm")),
         own_mm=_pair(result.get("template", {}).get("sigma_mm")),
         views=tuple(seen_before(view) for view in result.get("template", {}).get("views", ())),

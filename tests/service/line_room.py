@@ -50,6 +50,10 @@ confirm_moves = false
 """
 
 
+# what says where the fiducial is here fits nothing to images
+IMAGING = '[imaging]\nlocalization = "disc"\n'
+
+
 class LineClient(PumpedClient):
     """Lets the room do what it is asked for, in the control loop's thread, each time it pumps."""
 
@@ -64,7 +68,7 @@ class LineRoom:
     """`call` orders, `do` what happens to the room, `until` the state is as wanted."""
 
     def __init__(self, folder: Path, more: str = "", seed: int = 1) -> None:
-        text = _FILE.format(more=more)
+        text = _FILE.format(more=more if "[imaging]" in more else more + "\n" + IMAGING)
         if "confirm_moves = true" in more:
             text = text.replace("confirm_moves = false\n", "")
         (folder / "room.toml").write_text(text)
