@@ -299,7 +299,7 @@ def _found_as_disc(
         elif (
             region is not None and gate_px > SEARCH_PX
         ):  # the engine looks no further than that from a start
-            start_px = _start_in_region(frames, radius_px, region)
+            start_px = _start_in_region(frames, method, radius_px, region)
         else:
             start_px = expected_px
         found = _localize_by(method, frames, start_px, radius_px, request, psf)
@@ -379,20 +379,26 @@ def _start_anywhere(
 ) -> NDArray[np.float64] | None:
     """None where the method's own search over the whole slice serves."""
     if region_px is not None:
-        return _start_in_region(frames, radius_px, region_px)
+        return _start_in_region(frames, method, radius_px, region_px)
     if method in get_args(PaperMethod):  # a circle transform takes any edge that is round
         rows, cols = frames.geometry.shape
-        return _start_in_region(frames, radius_px, (0, 0, rows, cols))
+        return _start_in_region(frames, method, radius_px, (0, 0, rows, cols))
     return None
 
 
 def _start_in_region(
-    frames: Frames, radius_px: tuple[float, float], region_px: Sequence[float]
+    frames: Frames, method: str, radius_px: tuple[float, float], region_px: Sequence[float]
 ) -> NDArray[np.float64]:
     """The one round object of the first frame that lies in the region, in the reference pose."""
     r0, c0, r1, c1 = _whole_pixels(frames.geometry.shape, region_px)
-    found = localize(frames.pixels[0, r0:r1, c0:c1], radius_px=radius_px)
-    return np.asarray(found.centre_px) + np.array([r0, c0]) - frames.shifts_px[0]
+    part = frames.pixels[0, r0:r1, c0:c1]
+    try:
+        centre_px = np.asarray(localize(part, radius_px=radius_px).centre_px)
+    except _BUT_NO_DISC:
+        if method not in get_args(PaperMethod):
+            raise
+        centre_px = compact_object(part, radius_px)[0]  # what is a circle there, it finds itself
+    return centre_px + np.array([r0, c0]) - frames.shifts_px[0]
 
 
 def _whole_pixels(
