@@ -15,30 +15,38 @@ import typer
 from room_config.exit_codes import BAD_INPUT
 from simulator.config import FiducialKind
 
-app = typer.Typer(no_args_is_help=True, help="Repeat the paper's experiments, ours beside them.")
+app = typer.Typer(no_args_is_help=True, help="Repeat the paper's experiments beside our own.")
 
 PIPE_WIDTH = 120
 
 
 @app.callback()
 def study() -> None:
-    """Repeat the paper's experiments, ours beside them."""
+    """Repeat the paper's experiments beside our own."""
 
 
 @app.command()
 def numerical(
-    trials: Annotated[int, typer.Option(help="Positions of the circle.")] = 100,
-    seed: Annotated[int, typer.Option(help="Of every random draw; same seed, same numbers.")] = 1,
+    trials: Annotated[int, typer.Option(help="Number of circle positions.")] = 100,
+    seed: Annotated[
+        int, typer.Option(help="Seed of every random draw; the same seed gives the same numbers.")
+    ] = 1,
     out: Annotated[Path | None, typer.Option(help="Folder for CSV, PNG and SVG.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="JSON instead of tables.")] = False,
     scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler, as tcp://HOST:PORT.")
+        str | None, typer.Option(help="Address of a Dask scheduler, such as tcp://HOST:PORT.")
     ] = None,
-    map_trials: Annotated[int, typer.Option(help="A cell of the map; 0 leaves it out.")] = 10,
-    radius: Annotated[float, typer.Option(help="Of the circle, px of the base frame.")] = 4.0,
+    map_trials: Annotated[
+        int, typer.Option(help="Trials per cell of the map; 0 leaves it out.")
+    ] = 10,
+    radius: Annotated[
+        float, typer.Option(help="Radius of the circle, px of the base frame.")
+    ] = 4.0,
     snr: Annotated[float, typer.Option(help="Amplitude over noise per channel.")] = 20.0,
     blur: Annotated[float, typer.Option(help="Sigma of the Gaussian blur, px.")] = 0.2,
-    sensitivity: Annotated[float, typer.Option(help="Of the circle finding, 0 to 1.")] = 0.85,
+    sensitivity: Annotated[
+        float, typer.Option(help="Sensitivity of the circle finder, 0 to 1.")
+    ] = 0.85,
     shift_set: Annotated[
         str, typer.Option(help="paper (random), quarter, half or lattice5.")
     ] = "paper",
@@ -65,12 +73,14 @@ def numerical(
 
 @app.command()
 def benchtop(
-    trials: Annotated[int, typer.Option(help="Punctures a strategy, in rooms of 14.")] = 140,
-    seed: Annotated[int, typer.Option(help="Of every random draw; same seed, same numbers.")] = 1,
+    trials: Annotated[int, typer.Option(help="Punctures per strategy, in rooms of 14.")] = 140,
+    seed: Annotated[
+        int, typer.Option(help="Seed of every random draw; the same seed gives the same numbers.")
+    ] = 1,
     out: Annotated[Path | None, typer.Option(help="Folder for CSV, PNG and SVG.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="JSON instead of tables.")] = False,
     scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler, as tcp://HOST:PORT.")
+        str | None, typer.Option(help="Address of a Dask scheduler, such as tcp://HOST:PORT.")
     ] = None,
     snr: Annotated[float, typer.Option(help="Contrast over noise, one camera pixel.")] = 10.0,
     step_scatter: Annotated[
@@ -84,12 +94,14 @@ def benchtop(
 
 @app.command()
 def mri(
-    trials: Annotated[int, typer.Option(help="Punctures a strategy, in rooms of 14.")] = 140,
-    seed: Annotated[int, typer.Option(help="Of every random draw; same seed, same numbers.")] = 1,
+    trials: Annotated[int, typer.Option(help="Punctures per strategy, in rooms of 14.")] = 140,
+    seed: Annotated[
+        int, typer.Option(help="Seed of every random draw; the same seed gives the same numbers.")
+    ] = 1,
     out: Annotated[Path | None, typer.Option(help="Folder for CSV, PNG and SVG.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="JSON instead of tables.")] = False,
     scheduler: Annotated[
-        str | None, typer.Option(help="Address of a Dask scheduler, as tcp://HOST:PORT.")
+        str | None, typer.Option(help="Address of a Dask scheduler, such as tcp://HOST:PORT.")
     ] = None,
     snr: Annotated[float, typer.Option(help="Signal over noise per channel, one pixel.")] = 10.0,
     step_scatter: Annotated[
@@ -119,10 +131,10 @@ def _run_navigation(
     room: tuple[FiducialKind, bool] = ("sphere", False),
 ) -> None:
     checks = (
-        (3 <= trials <= 1_000_000, f"--trials is {trials}; 3 to 1000000 are possible"),
-        (0 <= seed < 2**31, f"--seed is {seed}; 0 to 2147483647 is possible"),
-        (5.0 <= snr <= 1e6, f"--snr is {snr:g}; 5 to 1000000 is possible"),
-        (0.0 <= step_scatter <= 0.05, f"--step-scatter is {step_scatter:g}; 0 to 0.05 is possible"),
+        (3 <= trials <= 1_000_000, f"--trials is {trials}; allowed: 3 to 1000000"),
+        (0 <= seed < 2**31, f"--seed is {seed}; allowed: 0 to 2147483647"),
+        (5.0 <= snr <= 1e6, f"--snr is {snr:g}; allowed: 5 to 1000000"),
+        (0.0 <= step_scatter <= 0.05, f"--step-scatter is {step_scatter:g}; allowed: 0 to 0.05"),
     )
     for holds, message in checks:
         if not holds:
@@ -193,15 +205,15 @@ def _run_numerical(
 
 def _check(trials: int, map_trials: int, seed: int, radius: float, snr: float, blur: float) -> None:
     checks = (
-        (2 <= trials <= 1_000_000, f"--trials is {trials}; 2 to 1000000 are possible"),
+        (2 <= trials <= 1_000_000, f"--trials is {trials}; allowed: 2 to 1000000"),
         (
             map_trials == 0 or 2 <= map_trials <= 100_000,
-            f"--map-trials is {map_trials}; 0 or 2 to 100000 are possible",
+            f"--map-trials is {map_trials}; allowed: 0, or 2 to 100000",
         ),
         (0 <= seed < 2**63, f"--seed is {seed}; it must not be negative"),
-        (1.5 <= radius <= 20.0, f"--radius is {radius:g} px; 1.5 to 20 is possible"),
-        (1.0 <= snr <= 1e6, f"--snr is {snr:g}; 1 to 1000000 is possible"),
-        (0.0 <= blur <= 3.0, f"--blur is {blur:g} px; 0 to 3 is possible"),
+        (1.5 <= radius <= 20.0, f"--radius is {radius:g} px; allowed: 1.5 to 20"),
+        (1.0 <= snr <= 1e6, f"--snr is {snr:g}; allowed: 1 to 1000000"),
+        (0.0 <= blur <= 3.0, f"--blur is {blur:g} px; allowed: 0 to 3"),
     )
     for holds, message in checks:
         if not holds:

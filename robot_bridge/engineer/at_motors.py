@@ -64,6 +64,7 @@ def find_encoder(args: argparse.Namespace, config: BridgeConfig) -> None:
     with sessions.bench(config) as (motors, journal):
         _refuse_if_held(journal)
         _check_room_for(axis, motors.measure_um(axis.name), SCRIPT_STEPS)
+        _forget(journal, axis)
         found = motors.find_encoder(axis.name)
     step_um = (axis.step_um_forward + axis.step_um_reverse) / 2
     show(
@@ -133,6 +134,12 @@ def _refuse_if_held(journal: Journal) -> None:
         raise CouldNotError(f"refused, stop_latched: stop {journal.stop.number}; re-arm first")
 
 
+def _forget(journal: Journal, axis: AxisConfig) -> None:
+    """It is moved by something that no bridge counts."""
+    stands = {name: stand for name, stand in journal.stands.items() if name != axis.name}
+    journal.keep_stands(stands, time.time())
+
+
 def measure_steps(args: argparse.Namespace, config: BridgeConfig) -> None:
     """Run one axis in open loop there and back; print the lines for the room's file."""
     _require_direct(args, "runs the motor in open loop")
@@ -145,6 +152,7 @@ def measure_steps(args: argparse.Namespace, config: BridgeConfig) -> None:
         read_um = None if axis.drive == "closed_loop" else ask_for_um
         if read_um is None:
             _check_room_for(axis, motors.measure_um(axis.name), args.steps)
+        _forget(journal, axis)
         measured = calibrate_steps(motors, axis, steps=args.steps, runs=args.runs, read_um=read_um)
     show(args, measured.as_fields())
 

@@ -10,9 +10,10 @@ then.
 from robot_bridge.daemon.config import HOMING_OVERTRAVEL
 from robot_bridge.pmd import protocol as pmd_protocol
 from robot_bridge.pmd import units as pmd_units
-from robot_bridge.pmd.axis import FOLLOWS, PmdAxis, agrees, disagreement
+from robot_bridge.pmd.axis import PmdAxis
 from robot_bridge.pmd.controller import AxisFaultError, Steps
 from robot_bridge.pmd.line import Procedure
+from robot_bridge.pmd.progress import FOLLOWS, agrees, disagreement
 from robot_bridge.pmd.protocol import Command
 from robot_bridge.pmd.status import Inputs
 

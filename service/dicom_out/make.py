@@ -21,12 +21,11 @@ from typing import TYPE_CHECKING, Literal
 from case_record.connection import is_older
 from case_record.record import CaseRecord, CaseRecordError
 from service.dicom_out.errors import OutputError
-from service.procedure.registry import APPROACHES
 
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
-from service.dicom_out.finding import Finding
+from service.dicom_out.finding import Finding, arrivals_said_ready
 
 FOLDER = "outputs"
 Kind = Literal["image", "report", "presentation"]
@@ -73,10 +72,9 @@ def outputs_to_send(record: CaseRecord, after_measurement: int = 0) -> Iterator[
             if (row.result or {}).get("reconstruction"):
                 yield Output("measurement", row.measurement_id, "image")
         after_measurement = rows[-1].measurement_id
-    for procedure in record.procedures():
-        if procedure.name in APPROACHES and procedure.state == "done":
-            yield Output("approach", procedure.procedure_id, "report")
-            yield Output("approach", procedure.procedure_id, "presentation")
+    for procedure_id in arrivals_said_ready(record):
+        yield Output("approach", procedure_id, "report")
+        yield Output("approach", procedure_id, "presentation")
     for event in record.events_of_kind("puncture"):
         yield Output("puncture", event.event_id, "report")
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dicom_slice.reasons import Reason
 from service.procedure.estimate import FiducialEstimate, MotionNoise, motion_covariance
@@ -278,7 +278,7 @@ def check_prediction(
     sigmas = predicted.distance_sigma(found.plane_mm, found.covariance_mm2)
     allowed = gate.gate_sigma
     if len(found.plane_mm) != 2:
-        allowed = math.sqrt(chi2.isf(chi2.sf(gate.gate_sigma**2, 2), len(found.plane_mm)))
+        allowed = math.sqrt(chdtri(len(found.plane_mm), math.exp(-(gate.gate_sigma**2) / 2)))
     if not sigmas <= allowed:
         miss = found.plane_mm - predicted.plane_mm
         listed = ", ".join(f"{value:+.3f}" for value in miss)

@@ -89,7 +89,12 @@ class Room:
         return configured if guide or guide is None else None
 
     def travel(self) -> dict[str, Travel]:
-        return {axis: Travel(low, high) for axis, (low, high) in self.link.travel_left_um.items()}
+        status = self.link.status
+        unsure_um = status.bound_um if status else {}
+        return {
+            axis: Travel(low, high, unsure_um.get(axis, 0))
+            for axis, (low, high) in self.link.travel_left_um.items()
+        }
 
     def seed(self) -> int:
         """Of the next procedure's random choices: from the case's seed and its number."""

@@ -25,6 +25,7 @@ from case_record.rows import Event, Measurement
 from robot_bridge.client.client import BridgeStatus
 from service.procedure.plan import SAME_PLACE_UM
 from service.procedure.scan_frame import (
+    CASE_REOPENED,
     ScanFrame,
     frame_of,
     other_place_since,
@@ -123,7 +124,8 @@ def why_not_now(record: CaseRecord, measurement: Measurement, now: Now) -> Lost 
     if facts is None:
         return Lost("unknown", "it is unknown what the measurement relies on")
     return (
-        _robot_changed(facts, now)
+        _case_ended(record, measurement)
+        or _robot_changed(facts, now)
         or _scanner_changed(record, measurement)
         or _too_old(facts, now)
         or _measured_again(record, measurement)
@@ -203,6 +205,14 @@ def _target_changed(record: CaseRecord, approach: Mapping[str, Any]) -> Lost | N
     if "entry" in approach and current_entry_number(record) != approach["entry"]:
         return Lost("target_changed", "the entry point has since been changed")
     return None
+
+
+def _case_ended(record: CaseRecord, measurement: Measurement) -> Lost | None:
+    """Also where it was opened again: who has lain on the table in between is not known."""
+    reopened = record.last_event(CASE_REOPENED)
+    if reopened is None or reopened.seq < measurement.requested_seq:
+        return None
+    return Lost("case_ended", "measured before the case was finished and opened again")
 
 
 def why_stood_no_more(facts: Mapping[str, Any], status: BridgeStatus | None) -> Lost | None:

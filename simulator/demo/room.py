@@ -120,10 +120,10 @@ class DemoRoom:
         try:
             while ask_where(address).moving:
                 if time.monotonic() > deadline_s:
-                    return f"the stages still moved after {timeout_s:.0f} s"
+                    return f"the stages were still moving after {timeout_s:.0f} s"
                 time.sleep(0.05)
         except TruthError:
-            return "the emulated motors are gone; nothing can move"
+            return "the emulated motors have ended; nothing can move"
         return "the stages stand still"
 
     def _motors_words(self) -> list[str]:

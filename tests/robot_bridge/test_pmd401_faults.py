@@ -249,7 +249,7 @@ def test_one_wrong_bit_that_makes_a_motion_of_a_status_question_is_stopped_at_on
         made.bus._with_wrong_bit = lambda line: line.replace(b"U0", b"T0")
         wait_until(motors, lambda s: not motors._other)
         with made.lock:
-            made.bus.faults.garble_commands = 1
+            made.bus.faults.garble_commands = 3  # both positions are asked first
         status = wait_until(motors, lambda s: s.fault is not None)
         made.bus._with_wrong_bit = real
         assert "damaged on the line" in status.fault_text

@@ -5,10 +5,15 @@ import time
 import pytest
 from line_room import IMAGING, patient_mm, running_line_room
 
-from case_record.record import CaseRecord
+from case_record.record import CaseRecord, CaseRecordError
+from service.dicom_out.finding import finding_of_arrival
+from service.dicom_out.make import outputs_to_send
+from service.dicom_out.report import comment_of
 from service.room.context import now_of
 from service.room.present import Now, lost_since_ready, readiness, why_not_now
 from service.room.readiness import ConflictError
+from service.slicer.messages import STATUS_HEAD
+from service.slicer.scene import scene_of, standing
 
 
 @pytest.fixture
@@ -151,6 +156,16 @@ def test_what_changes_after_a_measurement_takes_it_back_wherever_it_is_shown(roo
     with room.record() as record:
         assert lost_since_ready(record, 2) is not None
         assert not record.events_of_kind("puncture")
+        # what is written for good says what was, and of what instant
+        said = comment_of(finding_of_arrival(record, 2))
+        assert "stood at its target when READY was said" in said
+        assert {one.subject for one in outputs_to_send(record)} == {"approach"}
+    # whoever follows by OpenIGTLink
+    scene = scene_of(state)
+    assert STATUS_HEAD.unpack_from(scene["AutoSPINe"].content)[2].rstrip(b"\0") != b"READY"
+    seen = standing(state)
+    assert (seen.arrival, seen.reconstruction) == (None, None)
+    assert (seen.measurement is not None) == (change in _ONLY_READY)
 
 
 @pytest.mark.parametrize("change", ["stop", "target changed", "other study", "park"])
@@ -199,6 +214,77 @@ def test_the_clock_is_set_and_the_next_arrival_locks_all_the_same(room, monkeypa
     with pytest.raises(ConflictError) as refused:
         room.call("jog", axis="xt", distance_um=1000)
     assert refused.value.code == "insertion_locked"
+
+
+def test_a_case_that_has_ended_leaves_nothing_behind_even_if_it_is_opened_again(tmp_path):
+    with running_line_room(tmp_path, many_cases=True) as room:
+        folder = room.call("begin_case", label="anna", operator="", note="")
+        room.ready()
+        with pytest.raises(ConflictError, match="withdrawn"):
+            room.call("finish_case")
+        room.call("puncture")
+        room.call("needle_out")
+        assert room.later().error is not None
+        room.call("finish_case")
+        state = room.later()
+        assert not state.ready
+        for shown in (
+            "case_folder",
+            "measurement",
+            "error",
+            "target_patient_mm",
+            "slice",
+            "arrival",
+        ):
+            assert getattr(state, shown) is None
+        seen = standing(state)
+        assert (seen.measurement, seen.arrival, seen.reconstruction) == (None, None, None)
+        with pytest.raises(ConflictError) as refused:
+            room.call("puncture")
+        assert refused.value.code == "no_case"
+        room.call("reopen_case", folder=folder)
+        state = room.until(lambda s: s.case_folder == folder and s.measurement)
+        assert (state.error, state.measurement.lost.code) == (None, "case_ended")
+        assert not state.calibrated
+        assert standing(state).measurement is None
+
+
+@pytest.mark.parametrize("step_s", [3600, -3600, -5])
+def test_a_clock_that_is_set_while_slices_are_awaited_is_an_alarm_and_the_hold_begins_anew(
+    room, monkeypatch, step_s
+):
+    real = time.time
+    room.calibrate()
+    room.call("compare_clocks", offset_s=0.0, uncertainty_s=0.02)
+    room.do(lambda: setattr(room, "scanning", False))
+    room.call("set_target", patient_mm=patient_mm(41.0, 58.0))
+    room.call("start_approach")
+    before = room.until(lambda s: s.acquisition_request).acquisition_request.hold_id
+    monkeypatch.setattr(time, "time", lambda: real() + step_s)
+    state = room.until(lambda s: s.acquisition_request and s.acquisition_request.hold_id != before)
+    (alarm,) = [one for one in state.alarms if one.code == "clock_set"]
+    assert f"{step_s:+.1f} s" in alarm.text
+    assert state.clock is None  # the comparison was with the clock as it was before
+    assert state.hold.settled_at_s == pytest.approx(real() + step_s, abs=3)
+    room.do(lambda: setattr(room, "scanning", True))
+    room.run_to_end()
+    assert room.until(lambda s: s.ready)
+    room.call("compare_clocks", offset_s=0.0, uncertainty_s=0.02)
+    assert "clock_set" not in {one.code for one in room.later().alarms}
+
+
+def test_a_clock_that_was_set_between_two_cases_is_known_to_the_next_one(tmp_path, monkeypatch):
+    real = time.time
+    with running_line_room(tmp_path, many_cases=True) as room:
+        room.call("begin_case", label="anna", operator="", note="")
+        room.call("compare_clocks", offset_s=0.0, uncertainty_s=0.02)
+        room.call("finish_case")
+        monkeypatch.setattr(time, "time", lambda: real() - 700)
+        room.until(lambda s: s.at_s < real() - 600)
+        room.call("begin_case", label="berta", operator="", note="")
+        state = room.until(lambda s: s.alarms)
+        assert "clock_set" in {one.code for one in state.alarms}
+        assert state.clock is None
 
 
 def test_between_a_move_and_the_next_measurement_there_is_no_error(room):
@@ -456,6 +542,10 @@ def test_slices_of_another_frame_between_the_look_and_its_measurement_count_too(
     state = room.later()
     assert not state.ready
     assert state.measurement.lost.code == "other_place"
+    with room.record() as record:  # READY was never said: nothing says that it was
+        assert not list(outputs_to_send(record))
+        with pytest.raises(CaseRecordError, match="did not reach READY"):
+            finding_of_arrival(record, record.last_procedure("approach", "done").procedure_id)
 
 
 @pytest.mark.parametrize(

@@ -79,10 +79,7 @@ class RobotCommands:
         try:
             check_travel({axis: setpoint_um}, travel)
         except PlanRefusedError as error:
-            known = (
-                f"; its position is known to within {status.bound_um.get(axis, 0) / 1000:.3f} mm"
-            )
-            raise ConflictError("out_of_travel", f"Not moved: {error}{known}.") from error
+            raise ConflictError("out_of_travel", f"Not moved: {error}.") from error
         setpoints_um = {**status.positions_um, axis: setpoint_um}
         return self._room.begin(JOG, {"setpoints_um": setpoints_um}, by)
 
