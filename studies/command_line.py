@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 import typer
 
 from room_config.exit_codes import BAD_INPUT
+from simulator.config import FiducialKind
 
 app = typer.Typer(no_args_is_help=True, help="Repeat the paper's experiments beside our own.")
 
@@ -106,10 +107,16 @@ def mri(
     step_scatter: Annotated[
         float, typer.Option(help="Relative scatter of the motors' step length.")
     ] = 0.002,
+    fiducial: Annotated[
+        FiducialKind,
+        typer.Option(help="A sphere, or slightly oval with a cannula's void."),
+    ] = "sphere",
+    encoders: Annotated[bool, typer.Option("--encoders", help="On every axis.")] = False,
 ) -> None:
     """The paper's Table III, MRI columns: every strategy steers by the virtual scanner."""
     with _one_line_errors():
-        _run_navigation("mri", trials, seed, out, as_json, scheduler, snr, step_scatter)
+        room = (fiducial, encoders)
+        _run_navigation("mri", trials, seed, out, as_json, scheduler, snr, step_scatter, room)
 
 
 def _run_navigation(
@@ -121,6 +128,7 @@ def _run_navigation(
     scheduler: str | None,
     snr: float,
     step_scatter: float,
+    room: tuple[FiducialKind, bool] = ("sphere", False),
 ) -> None:
     checks = (
         (3 <= trials <= 1_000_000, f"--trials is {trials}; allowed: 3 to 1000000"),
@@ -138,7 +146,10 @@ def _run_navigation(
 
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-    groups = navigation_study.groups_of(setup, trials, seed, snr, step_scatter)
+    fiducial, encoders = room
+    groups = navigation_study.groups_of(
+        setup, trials, seed, snr, step_scatter, fiducial, encoders=encoders
+    )
     with cluster.mapper(scheduler) as mapper, _progress_bar("rooms", len(groups)) as advance:
         study = navigation_study.run_study(setup, groups, mapper, advance)
     files: list[Path] = []
@@ -146,7 +157,8 @@ def _run_navigation(
         files = navigation_report.write_csv(study, out)
         files += navigation_report.draw_punctures(study, out)
     if as_json:
-        settings = {"trials": trials, "seed": seed, "snr": snr, "step_scatter": step_scatter}
+        settings: dict[str, object] = {"trials": trials, "seed": seed, "snr": snr}
+        settings |= {"step_scatter": step_scatter, "fiducial": fiducial, "encoders": encoders}
         typer.echo(json.dumps(navigation_report.as_json(study, settings, files), allow_nan=False))
         return
     console = Console()

@@ -18,7 +18,7 @@ from service.procedure.plane import ImagePlane
 from service.procedure.registry import APPROACHES, GUIDE_APPROACH
 from service.room.history import targets_over_time
 from service.room.present import READY
-from sr_engine.worker import geometry_of
+from sr_engine.request import geometry_of
 
 
 @dataclass(frozen=True)
