@@ -48,7 +48,7 @@ def arm(client: RoomClient) -> None:
 def wait_until(
     holds: Callable[[], object],
     process: subprocess.Popen[str] | None = None,
-    timeout_s: float = 120,
+    timeout_s: float = 600,
 ) -> None:
     deadline_s = time.monotonic() + timeout_s
     while not holds():
@@ -113,6 +113,7 @@ class Person:
             rows.writerows((*name, *place) for name, place in self.holes.items())
 
 
+@pytest.mark.timeout(1800)
 def test_a_study_in_the_room_survives_a_sudden_end_and_gives_the_papers_table(bench, tmp_path):
     out = tmp_path / "study"
     person = Person(bench, out, "base,adaptive", 2)

@@ -63,6 +63,8 @@ class BenchDemoRoom(DemoRoom):
             "lens_file": "lens.json",
             "service_url": f"http://127.0.0.1:{tables['service']['port']}",
             "preview_port": 0,
+            # the camera is rendered on this computer, which has other things to do
+            "stall_s": 30.0,
             **self.camera,
         }
 

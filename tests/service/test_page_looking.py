@@ -10,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 from attended_room import AttendedRoom, arm, calibrated, stop_all, wait_for
-from browser import laid_out, serious_violations, set_theme
+from browser import laid_out, set_theme, violations
 from lone_service import running_service
 from playwright.sync_api import Browser, Locator, Page, expect
 from test_api_documents import copy_case
@@ -246,7 +246,7 @@ def test_an_emergency_looks_unlike_a_stop_and_says_what_to_do(
     assert [e.kind for e in client.events()][-20:].count("emergency") == 1
     for theme in ("dark", "light"):
         set_theme(page, theme)
-        assert not serious_violations(page)
+        assert not violations(page)
     page.get_by_role("button", name="Re-arm the robot").click()
     expect(banner).to_be_hidden()
     expect(page.locator("#chips")).to_contain_text("Armed")
