@@ -146,6 +146,11 @@ class ServiceConfig(Section):
         description="What people type to come to the page where a reverse proxy stands in between, "
         "as https://navigator.example.org/room1/; empty: they come to host and port themselves.",
     )
+    camera_preview_url: str = Field(
+        default="",
+        pattern=r"^(https?://\S+)?$",
+        description="At a bench: the live view of `autospine camera`; the page links to it.",
+    )
     trusted_proxies: list[str] = Field(
         default=["127.0.0.1", "::1"],
         description="Addresses and networks of the proxies whose X-Forwarded-For says who asks.",

@@ -52,8 +52,9 @@ export class Images {
     this.smooth = button(words.smooth, () => this.toggleSmooth(), { "aria-pressed": "false" });
     this.profile = button(words.profile, () => this.toggleProfile(), { "aria-pressed": "false", id: "profile" });
     this.newest = button(words.newest, () => this.choose(null), { hidden: true, id: "newest-slice" });
+    this.camera = h("a", { hidden: true, id: "camera", target: "_blank", rel: "noopener" }, words.camera);
     const bar = h("div", { class: "bar" },
-      h("span", { class: "group", role: "group", "aria-label": words.which }, this.buttons), this.newest,
+      h("span", { class: "group", role: "group", "aria-label": words.which }, this.buttons), this.newest, this.camera,
       h("label", {}, words.window, " ", this.window), h("label", {}, words.level, " ", this.level),
       button(words.auto, () => { this.manual = null; this.repaint(); }),
       this.shareLabel, this.smooth, this.profile, h("span", { class: "push" }),
@@ -102,6 +103,8 @@ export class Images {
     // a new slice is what matters: it is shown, unless somebody picks on an older one just now
     if (before && state.slice?.slice_id !== before && !this.picking.isOn) this.chosen = null;
     this.newest.hidden = !this.chosen;
+    this.camera.hidden = !state.camera_preview_url;
+    if (state.camera_preview_url) this.camera.href = state.camera_preview_url;
     this.picking.draw(state, role);
     if (state.slice) this.loadSlice({ id: this.shownId() });
     if (state.reconstruction) this.loadSr({ id: state.reconstruction.measurement_id });
