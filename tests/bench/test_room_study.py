@@ -6,9 +6,10 @@ import csv
 import json
 import signal
 import subprocess
+import threading
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import numpy as np
@@ -18,7 +19,7 @@ from scipy.ndimage import gaussian_filter
 from virtual_bench import BenchDemoRoom
 
 from room_config.shell import autospine
-from service.client import RoomClient
+from service.client import RefusedByServiceError, RoomClient, ServiceGoneError
 from simulator.demo.room import DemoOptions
 from simulator.truth_client import TruthAddress, ask_where
 from studies.measured_places import COLUMNS, holes_of, read_places
@@ -43,6 +44,27 @@ def bench(tmp_path: Path) -> Iterator[BenchDemoRoom]:
 def arm(client: RoomClient) -> None:
     wait_until(lambda: client.state().robot.linked)
     client.reset(client.state().robot.taken_um)
+
+
+@contextmanager
+def rescanning(client: RoomClient) -> Iterator[None]:
+    """Somebody at the page says yes where a slice could not be used."""
+    done = threading.Event()
+
+    def answer() -> None:
+        while not done.wait(0.5):
+            with suppress(RefusedByServiceError, ServiceGoneError):
+                question = client.state().question
+                if question is not None and "rescan" in question.choices:
+                    client.answer(question.question_id, "rescan")
+
+    thread = threading.Thread(target=answer)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
 
 
 def wait_until(
@@ -117,7 +139,7 @@ class Person:
 def test_a_study_in_the_room_survives_a_sudden_end_and_gives_the_papers_table(bench, tmp_path):
     out = tmp_path / "study"
     person = Person(bench, out, "base,adaptive", 2)
-    with RoomClient(bench.url, by="tester") as client:
+    with RoomClient(bench.url, by="tester") as client, rescanning(client):
         with person.begun() as first:
             arm(client)
             while not person.holes:
@@ -157,7 +179,7 @@ def test_a_study_in_the_room_survives_a_sudden_end_and_gives_the_papers_table(be
 def test_the_whole_table_ii_in_the_virtual_bench(bench, tmp_path):
     out = tmp_path / "study"
     person = Person(bench, out, ",".join(STRATEGY_NAMES), 14)
-    with RoomClient(bench.url, by="tester") as client:
+    with RoomClient(bench.url, by="tester") as client, rescanning(client):
         with person.begun() as first:
             arm(client)
             for _ in range(20):
