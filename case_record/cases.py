@@ -60,7 +60,7 @@ class Cases:
         """As `open`; NoCaseError where no case is open."""
         folder = self.open
         if folder is None:
-            raise NoCaseError("No case is open: begin one (New case).")
+            raise NoCaseError("No case is open: start one (New case).")
         return folder
 
     def named(self, name: str | None) -> Path:
@@ -99,7 +99,7 @@ class Cases:
                 folder.mkdir(mode=_FOLDER_MODE)
             except OSError as error:
                 if not folder.exists():
-                    raise CasesError(f"{folder}: cannot be made ({error.strerror})") from error
+                    raise CasesError(f"{folder}: cannot be created ({error.strerror})") from error
                 number += 1
             else:
                 return folder
@@ -125,8 +125,8 @@ class Cases:
     def _refuse_if_only_one(self) -> None:
         if self.only is not None:
             raise CasesError(
-                "This room's file names a single case_dir: its case is always open. With "
-                "cases_dir instead, cases begin and end on the page."
+                "This room's file names a single case_dir, so its case is always open. Use "
+                "cases_dir to start and finish cases on the page."
             )
 
     def _read_open(self) -> Path | None:
@@ -139,7 +139,7 @@ class Cases:
         if not name:
             return None
         if Path(name).name != name or name in (".", ".."):
-            raise CasesError(f"{self.home / OPEN_FILE}: {name[:80]!r} is not a folder's name")
+            raise CasesError(f"{self.home / OPEN_FILE}: {name[:80]!r} is not a folder name")
         return self.home / name
 
 

@@ -46,6 +46,8 @@ class Connection:
         busy_timeout_s: float = _BUSY_TIMEOUT_S,
     ) -> None:
         self.case_dir = Path(case_dir)
+        self.read_only = read_only
+        self.was_older = False
         path = self.case_dir / FILE_NAME
         if create:
             self.case_dir.mkdir(parents=True, exist_ok=True, mode=0o700)
@@ -87,7 +89,7 @@ class Connection:
         if version > SCHEMA_VERSION:
             raise CaseRecordError(
                 f"{self.case_dir}: the case record has schema version {version}, newer than "
-                f"this program's {SCHEMA_VERSION}; it was left untouched"
+                f"this program's {SCHEMA_VERSION}; it was left unchanged"
             )
         return version
 
@@ -101,7 +103,8 @@ class Connection:
 
     def _bring_copy_up(self) -> None:
         version = self._version()
-        if version == SCHEMA_VERSION:
+        self.was_older = version < SCHEMA_VERSION
+        if not self.was_older:
             return
         copy = sqlite3.connect(":memory:", isolation_level=None)
         copy.row_factory = sqlite3.Row
@@ -150,6 +153,12 @@ class Connection:
     def change_count(self) -> tuple[int, int]:
         """As `data_version`, and a number that also changes with what this connection wrote."""
         return self.data_version(), self._db.total_changes
+
+
+def is_older(case_dir: Path) -> bool:
+    """Whether a program before this one made the record; to write there would change it."""
+    with Connection(case_dir, read_only=True) as found:
+        return found.was_older
 
 
 def _for_its_owner_alone(case_dir: Path, path: Path) -> None:

@@ -92,7 +92,7 @@ class Holding:
                 self._db.execute("PRAGMA synchronous = FULL")
                 self._db.executescript(_SCHEMA)
         except OSError as error:
-            raise CaseRecordError(f"{self.folder}: cannot be made ({error.strerror})") from error
+            raise CaseRecordError(f"{self.folder}: cannot be created ({error.strerror})") from error
         except sqlite3.DatabaseError as error:
             raise CaseRecordError(f"{path}: not a usable holding area ({error})") from error
         self._db.row_factory = sqlite3.Row

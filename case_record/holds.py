@@ -63,7 +63,7 @@ class Holds(Connection):
     def hold(self, hold_id: int) -> Hold:
         row = self._db.execute("SELECT * FROM hold WHERE hold_id = ?", (hold_id,)).fetchone()
         if row is None:
-            raise CaseRecordError(f"{self.case_dir}: there is no hold {hold_id}")
+            raise CaseRecordError(f"{self.case_dir}: no hold {hold_id}")
         return _hold(row)
 
     def open_hold(self) -> Hold | None:

@@ -58,7 +58,7 @@ class Measurements(Connection):
             "SELECT * FROM measurement WHERE measurement_id = ?", (measurement_id,)
         ).fetchone()
         if row is None:
-            raise CaseRecordError(f"{self.case_dir}: there is no measurement {measurement_id}")
+            raise CaseRecordError(f"{self.case_dir}: no measurement {measurement_id}")
         return _measurement(row)
 
     def last_measurement(self, state: str | None = None) -> Measurement | None:

@@ -59,7 +59,7 @@ class Moves(Connection):
     def move(self, command_id: str) -> Move:
         row = self._db.execute("SELECT * FROM move WHERE command_id = ?", (command_id,)).fetchone()
         if row is None:
-            raise CaseRecordError(f"{self.case_dir}: there is no move {command_id}")
+            raise CaseRecordError(f"{self.case_dir}: no move {command_id}")
         return _move(row)
 
     def has_move(self, command_id: str) -> bool:

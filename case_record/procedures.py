@@ -36,7 +36,7 @@ class Procedures(Connection):
             "SELECT * FROM procedure WHERE procedure_id = ?", (procedure_id,)
         ).fetchone()
         if row is None:
-            raise CaseRecordError(f"{self.case_dir}: there is no procedure {procedure_id}")
+            raise CaseRecordError(f"{self.case_dir}: no procedure {procedure_id}")
         return _procedure(row)
 
     def running_procedure(self) -> Procedure | None:

@@ -12,7 +12,6 @@ import time
 import uuid
 
 from case_record.connection import FILE_NAME, CaseRecordError, RecordUnavailableError
-from case_record.events import Events
 from case_record.holds import Holds
 from case_record.measurements import Measurements
 from case_record.moves import Moves
@@ -24,7 +23,7 @@ from case_record.slices import Slices
 __all__ = ["FILE_NAME", "CaseRecord", "CaseRecordError", "RecordUnavailableError"]
 
 
-class CaseRecord(Events, Holds, Slices, Measurements, Procedures, Moves, Seals):
+class CaseRecord(Holds, Slices, Measurements, Procedures, Moves, Seals):
     """One connection to the record of a case. Use it in the thread that opened it."""
 
     def start_case(self, name: str, seed: int) -> Case:

@@ -8,13 +8,17 @@ export): with it also a whole forged chain, or an older copy of the file, is fou
 
 from __future__ import annotations
 
+import hashlib
 import sqlite3
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
-from case_record.connection import CaseRecordError, Connection
+from case_record.connection import CaseRecordError
+from case_record.events import Events
 from case_record.sealing import FIRST, SEALED, next_seal, row_digest
+
+FILE_SEALED = "file_sealed"
 
 
 class TamperedError(CaseRecordError):
@@ -30,7 +34,7 @@ class Verified:
     head: str
 
 
-class Seals(Connection):
+class Seals(Events):
     """Checks of the chain. They read; nothing is mended.
 
     doubt: why nothing may rest on this record, as whoever opened it found; empty: nothing known.
@@ -61,7 +65,7 @@ class Seals(Connection):
                     raise self._tampered(f"{table} {row} was changed")
         for (table, row), digest in latest.items():
             if any(digest):
-                raise self._tampered(f"{table} {row} was taken away")
+                raise self._tampered(f"{table} {row} was removed")
         events = int(self._db.execute("SELECT COUNT(*) FROM event").fetchone()[0])
         return Verified(events, number, (previous or FIRST).hex())
 
@@ -77,6 +81,22 @@ class Seals(Connection):
             if seal is None or bytes(seal[0]) != row_digest(*values):
                 raise self._tampered(f"{table} {row} was changed")
 
+    def seal_file(self, name: str, content: bytes) -> None:
+        """Swear to a file that is about to be written: `name`, below the case's folder."""
+        body = {"name": name, "sha256": hashlib.sha256(content).hexdigest()}
+        self.append_event(FILE_SEALED, body, source="outputs")
+
+    def is_sealed(self, name: str) -> bool:
+        """Whether the record swears to a file of this name. TamperedError if it is another one."""
+        sealed = self.events_of_kind(FILE_SEALED)
+        digests = {event.body["sha256"] for event in sealed if event.body["name"] == name}
+        if not digests:
+            return False
+        with (self.case_dir / name).open("rb") as file:
+            if hashlib.file_digest(file, "sha256").hexdigest() not in digests:
+                raise self._tampered(f"{name} is not the file that was made")
+        return True
+
     def _check_file(self) -> None:
         """Indexes say what the tables say, and no page is damaged."""
         found = self._rows("PRAGMA integrity_check(1)")
@@ -87,7 +107,7 @@ class Seals(Connection):
             " COALESCE((SELECT MAX(seq) FROM slice), 0))"
         )[0]
         if last is None or last < highest:
-            raise self._tampered("the order of what happened does not fit")
+            raise self._tampered("the order of events does not match")
 
     def _rows(self, statement: str) -> list[tuple[Any, ...]]:
         try:

@@ -79,7 +79,7 @@ class Slices(Connection):
     def slice(self, slice_id: int) -> SliceRow:
         row = self._db.execute("SELECT * FROM slice WHERE slice_id = ?", (slice_id,)).fetchone()
         if row is None:
-            raise CaseRecordError(f"{self.case_dir}: there is no slice {slice_id}")
+            raise CaseRecordError(f"{self.case_dir}: no slice {slice_id}")
         return _slice(row)
 
     def slices_by_hand(self) -> frozenset[int]:

@@ -335,12 +335,12 @@ def _differs_from_set(
         if not matches:
             return Quarantined(
                 Reason.GEOMETRY_DIFFERS,
-                f"position, orientation or grid is not as in hold {other.hold_id} of its set",
+                f"position, orientation or grid differs from hold {other.hold_id} of its set",
             )
         if all(m.distortion_corrected != slice_.distortion_corrected for m in matches):
             return Quarantined(
                 Reason.DISTORTION_TWIN,
-                f"distortion correction is not as in hold {other.hold_id} of its set",
+                f"distortion correction differs from hold {other.hold_id} of its set",
             )
         return None
     return None
@@ -376,7 +376,7 @@ def _twin(slice_: Slice, hold: HoldWindow, known: Sequence[Known]) -> Quarantine
         if is_twin:
             return Quarantined(
                 Reason.DISTORTION_TWIN,
-                "the same acquisition is there with the other distortion correction",
+                "the same acquisition is already present with the other distortion correction",
             )
     return None
 

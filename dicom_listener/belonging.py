@@ -16,6 +16,9 @@ from dicom_slice.patient import Identity
 from dicom_slice.reasons import Reason, SetAside
 
 BOUND, ACCEPTED = "case_bound", "study_accepted"
+# a slice that waits outside of the case; of another case's study it is said whether it may be of
+# this patient
+HELD, SAME_PATIENT = "slice_held", "same_patient"
 
 
 @dataclass(frozen=True)
@@ -66,15 +69,20 @@ def why_not_of(binding: Binding | None, whose: Identity) -> SetAside | None:
     if binding is None:
         return None
     if _differ(binding.patient, whose.patient):
-        return SetAside(Reason.OTHER_PATIENT, "it is of another patient than this case")
+        return SetAside(Reason.OTHER_PATIENT, "it belongs to a different patient")
     if whose.study not in binding.studies:
-        return SetAside(Reason.OTHER_STUDY, "it is of another study than this case")
+        return SetAside(Reason.OTHER_STUDY, "it belongs to a different study")
     if _differ(binding.frame_of_reference, whose.frame_of_reference):
         return SetAside(
             Reason.OTHER_FRAME,
-            "its frame of reference is another one: the table or the patient was moved",
+            "it has a different frame of reference: the table or the patient was moved",
         )
     return None
+
+
+def may_be_same_patient(binding: Binding | None, whose: Identity) -> bool:
+    """False only where both are known, and are two."""
+    return binding is not None and not _differ(binding.patient, whose.patient)
 
 
 def _differ(bound: str, found: str) -> bool:

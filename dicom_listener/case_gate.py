@@ -15,16 +15,19 @@ from case_record.rows import Event, NewSlice
 from dicom_listener.belonging import (
     ACCEPTED,
     BOUND,
+    HELD,
+    SAME_PATIENT,
     Binding,
     after_event,
     event_body,
+    may_be_same_patient,
     why_not_of,
 )
 from dicom_listener.holding_area import INBOX, Arrival, HoldingArea
 from dicom_slice.patient import Identity
 from dicom_slice.reasons import Reason, SetAside
 
-HELD, TAKEN = "slice_held", "slices_taken"
+TAKEN = "slices_taken"
 # it would do, and came for a hold of this case: what becomes of the next ones depends on it
 _AT_A_HOLD = frozenset(
     {
@@ -62,7 +65,7 @@ class CaseGate:
             return None
         whose = arrival.identity
         if not whose.study:
-            return SetAside(Reason.UNKNOWN_STUDY, _reason_of(rows, "its study is not known"))
+            return SetAside(Reason.UNKNOWN_STUDY, _reason_of(rows, "its study is unknown"))
         if self.binding is not None and whose.study in self.binding.studies:
             why = why_not_of(self.binding, whose)
             return why if why is not None and why.code == Reason.OTHER_PATIENT else None
@@ -74,13 +77,16 @@ class CaseGate:
         if any(row.state != "quarantined" or row.reason_code in _AT_A_HOLD for row in rows):
             return None
         reason = _reason_of(rows, "set aside")
-        return SetAside(Reason.NO_SLICE_USED, f"{reason}; no slice of this case was used yet")
+        return SetAside(Reason.NO_SLICE_USED, f"{reason}; no slice of this case has been used yet")
 
     def hold(self, arrival: Arrival, why: SetAside) -> None:
         """Keep the file out of the case, whose record says that, and no more of whom it shows."""
         assert self._area is not None
         self._area.keep(arrival, why)
-        self._record.append_event(HELD, {"code": str(why.code)}, source=_SOURCE)
+        body: dict[str, object] = {"code": str(why.code)}
+        if why.code == Reason.OTHER_CASE:
+            body[SAME_PATIENT] = may_be_same_patient(self.binding, arrival.identity)
+        self._record.append_event(HELD, body, source=_SOURCE)
 
     def bring_in(self, path: Path) -> None:
         """Move the file into the case's inbox. OSError: it lies where it was."""

@@ -95,7 +95,7 @@ class OffsetUnknown:
 
 Offset = OffsetBounds | OffsetUnknown
 
-_WHAT_TO_DO = "compare the clocks, or confirm at which hold this acquisition was made"
+_WHAT_TO_DO = "compare the clocks, or confirm the hold at which this acquisition was made"
 
 
 @dataclass(frozen=True)
@@ -154,11 +154,11 @@ class ScannerClock:
         if self.set_at_s is not None and slice_.received_s < self.set_at_s + rules.late_limit_s:
             return OffsetUnknown(
                 "it may have been acquired before the scanner's clock was set: scan again, or "
-                "confirm at which hold this acquisition was made"
+                "confirm the hold at which this acquisition was made"
             )
         compared = self.by_comparison(slice_, rules)
         if compared is not None and _ahead_s(slice_, compared, rules) > rules.jump_tolerance_s:
-            return OffsetUnknown(f"it came sooner than the comparison allows: {_WHAT_TO_DO}")
+            return OffsetUnknown(f"it arrived sooner than the comparison allows: {_WHAT_TO_DO}")
         lows = [
             bounds.low_s
             for bounds in (compared, self._by_promptness(slice_, rules))
@@ -230,7 +230,7 @@ class ScannerClock:
 
     def _why_unknown(self, slice_: Received, rules: ClockRules) -> str:
         if rules.promptness is not None:
-            return f"no {rules.witnesses} slices came as promptly as was measured at this site"
+            return f"no {rules.witnesses} slices arrived as promptly as was measured at this site"
         if self.comparisons:
             age_min = abs(slice_.received_s - self.comparisons[-1].at_s) / 60
             return f"the clocks were compared {age_min:.0f} min away from it"
@@ -282,7 +282,7 @@ def _contradiction(clock: ScannerClock, slice_: Received, rules: ClockRules) -> 
         spread_s = rules.promptness.most_s - rules.promptness.least_s
         ahead_s = clock.least_lags[0][0] - spread_s - lag_s
         if ahead_s > rules.jump_tolerance_s:
-            return f"the scanner's clock is at least {ahead_s:.1f} s ahead of before"
+            return f"the scanner's clock is at least {ahead_s:.1f} s ahead of its earlier time"
     return ""
 
 
@@ -297,7 +297,7 @@ def _of_a_zone(ahead_s: float) -> str:
     halves = round(ahead_s / 1800)
     if not halves or abs(ahead_s - 1800 * halves) > 60:
         return ""
-    return " (about whole half hours: look at its time zone, and at scanner_time_zone)"
+    return " (close to a multiple of half an hour: check its time zone and scanner_time_zone)"
 
 
 def _break_of_habit(clock: ScannerClock, slice_: Received) -> str:
@@ -309,8 +309,8 @@ def _break_of_habit(clock: ScannerClock, slice_: Received) -> str:
     if sooner_s <= _MUCH_SOONER_S + (most_s - least_s):
         return ""
     return (
-        f"it came {sooner_s:.1f} s sooner after its acquisition than any of the "
-        f"{len(clock.lags_s)} slices before it, or the scanner's clock went forward"
+        f"it arrived {sooner_s:.1f} s sooner after its acquisition than any of the "
+        f"{len(clock.lags_s)} slices before it, or the scanner's clock was set forward"
     )
 
 
@@ -339,7 +339,7 @@ def _unlike_measured(clock: ScannerClock, slice_: Received, rules: ClockRules) -
     if delay_s <= promptness.most_s + rules.jump_tolerance_s:
         return ""
     return (
-        f"received {delay_s:.1f} s after the acquisition; no slice came later than "
+        f"received {delay_s:.1f} s after the acquisition; no slice arrived later than "
         f"{promptness.most_s:.1f} s when this was measured"
     )
 

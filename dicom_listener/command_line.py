@@ -30,10 +30,10 @@ def listener(
     config: Annotated[Path, typer.Option("--config", help="The room's TOML file.")],
     check: Annotated[
         bool,
-        typer.Option("--check", help="Try everything once (C-ECHO, write, clock, disk) and end."),
+        typer.Option("--check", help="Test everything once (C-ECHO, write, clock, disk) and exit."),
     ] = False,
     exit_with_parent: Annotated[
-        bool, typer.Option("--exit-with-parent", help="End when standard input is closed.")
+        bool, typer.Option("--exit-with-parent", help="Exit when standard input is closed.")
     ] = False,
 ) -> None:
     """Receive slices (C-STORE), keep them durably, and assign them to holds."""

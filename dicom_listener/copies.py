@@ -19,10 +19,10 @@ from dicom_slice.reasons import Reason, SetAside, UnusableError
 # what a change of the encoding changes, and what is only said about reading it
 _OF_THE_ENCODING = ("transfer_syntax_uid", "warnings", "rescale", "photometric")
 _CONFLICT = SetAside(
-    Reason.UID_CONFLICT, "an instance with this UID and other bytes is already here"
+    Reason.UID_CONFLICT, "an instance with this UID but different bytes is already here"
 )
 _COPY = SetAside(
-    Reason.REENCODED_COPY, "the same pixels are here already under this UID, encoded differently"
+    Reason.REENCODED_COPY, "the same pixels are already here under this UID, encoded differently"
 )
 
 

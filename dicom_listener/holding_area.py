@@ -18,7 +18,7 @@ from dicom_slice.patient import Identity, identity_of
 from dicom_slice.reasons import Reason, SetAside
 
 INBOX = "inbox"
-NO_CASE = SetAside(Reason.NO_CASE, "no case was open when it came")
+NO_CASE = SetAside(Reason.NO_CASE, "no case was open when it arrived")
 
 
 @dataclass(frozen=True)

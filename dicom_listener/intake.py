@@ -274,7 +274,8 @@ class Intake:
         stated = slice_.sop_instance_uid
         if stated and stated != envelope.sop_instance_uid:
             return SetAside(
-                Reason.UID_CONTRADICTION, "the data set has another UID than it was sent under"
+                Reason.UID_CONTRADICTION,
+                "the data set's UID differs from the one it was sent under",
             )
         unusable = why_not_usable(slice_, self._rules.slices)
         if unusable is None and slice_.frame in problems:

@@ -86,7 +86,7 @@ def await_request(connection: socket.socket, timeout_s: float) -> None:
             raise NoRequestError(f"no association request within {timeout_s:g} s")
         head = connection.recv(wanted, socket.MSG_PEEK)
         if not head:
-            raise NoRequestError("closed without a word")
+            raise NoRequestError("closed without sending anything")
         if head[0] != _ASSOCIATE_RQ:
             raise NoRequestError(f"not DICOM: first byte 0x{head[0]:02X}")
         if len(head) >= wanted > _HEAD_BYTES:

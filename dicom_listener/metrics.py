@@ -16,7 +16,7 @@ class ListenerMetrics:
         self.stored_bytes = self._counter("stored_bytes", "Data set bytes made durable")
         self.refused = self._counter("slices_refused", "C-STORE requests refused", "status")
         self.echoes = self._counter("echoes", "C-ECHO requests answered")
-        self.commitments = self._counter("commitments", "Storage commitments asked for", "status")
+        self.commitments = self._counter("commitments", "Storage commitments requested", "status")
         self.associations = self._counter("associations", "Associations by outcome", "outcome")
         self.endings = self._counter("association_endings", "Associations by ending", "ending")
         self.dropped = self._counter("connections_dropped", "Connections without an association")

@@ -117,10 +117,10 @@ def _why_not_then(record: CaseRecord, row: SliceRow, hold: Hold) -> str:
     settled_s = hold.settled_monotonic_s
     before = settled_s is not None and row.received_monotonic_s < settled_s
     if before or row.seq < hold.begun_seq:
-        return f"it was received before the robot stood at hold {hold.hold_id}"
+        return f"it was received before the robot settled at hold {hold.hold_id}"
     there = len(record.slices(hold_id=hold.hold_id, state="assigned"))
     if hold.ended_at_s is not None and there >= hold.expected_slices:
-        return f"hold {hold.hold_id} is over and has all its slices"
+        return f"hold {hold.hold_id} has ended and has all its slices"
     return ""
 
 
@@ -135,7 +135,7 @@ def _why_other(record: CaseRecord, row: SliceRow, planes_mm: Sequence[float]) ->
     ):
         mine, others = row.header.get(name), used.header.get(name)
         if mine and others and mine != others:
-            return f"it is of another {words} than the slices that are used"
+            return f"it has a different {words} from the slices in use"
     return _why_other_geometry(_geometry(row.header), _geometry(used.header), planes_mm)
 
 
@@ -143,16 +143,18 @@ def _why_other_geometry(
     mine: SliceGeometry, used: SliceGeometry, planes_mm: Sequence[float]
 ) -> str:
     if mine.shape != used.shape:
-        return f"its grid is {mine.shape}, that of the slices that are used {used.shape}"
+        return f"its grid is {mine.shape}, that of the slices in use {used.shape}"
     if not np.allclose(mine.spacing_mm, used.spacing_mm, atol=_SAME_SPACING_MM):
-        return f"its pixels are {mine.spacing_mm} mm, those of the used slices {used.spacing_mm} mm"
+        return (
+            f"its pixels are {mine.spacing_mm} mm, those of the slices in use {used.spacing_mm} mm"
+        )
     for name in ("row_direction", "col_direction"):
         if not np.allclose(getattr(mine, name), getattr(used, name), atol=_SAME_DIRECTION):
-            return "it lies in another plane than the slices that are used"
+            return "it lies in a different plane from the slices in use"
     at_mm = float(mine.normal @ np.array(mine.position_mm))
     wanted_mm = [*planes_mm, float(used.normal @ np.array(used.position_mm))]
     if not min(abs(at_mm - one) for one in wanted_mm) <= _SAME_PLANE_MM:
-        return f"it lies at {at_mm:.1f} mm, the slices that are used at {wanted_mm[-1]:.1f} mm"
+        return f"it lies at {at_mm:.1f} mm, the slices in use at {wanted_mm[-1]:.1f} mm"
     return ""
 
 

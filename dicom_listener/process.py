@@ -126,7 +126,7 @@ def _zone(name: str) -> ZoneInfo | None:
     try:
         return ZoneInfo(name)
     except (ZoneInfoNotFoundError, ValueError):
-        raise ConfigError(f"listener.scanner_time_zone: there is no zone {name!r}") from None
+        raise ConfigError(f"listener.scanner_time_zone: unknown time zone {name!r}") from None
 
 
 def open_scp(
@@ -211,7 +211,7 @@ def run(config: Config, stop: threading.Event, on_ready: Callable[[Ready], None]
         stack.callback(reception.close)
         reception.follow()
         if discarded:
-            text = f"{discarded} unanswered files of an earlier run"
+            text = f"{discarded} unanswered files from an earlier run"
             reception.alarm("unfinished_files", text)
         log.info("serving", port=scp.port, left_over=_requeue(reception, received))
         presence = stack.enter_context(Presence(cases.home, "listener"))
@@ -234,11 +234,11 @@ def _loop(
     while not stop.is_set():
         presence.beat()
         if not scp.is_listening:
-            raise ListeningEndedError("the thread that listens on the port has ended")
+            raise ListeningEndedError("the listening thread has ended")
         try:
             if reception.follow():
                 _requeue(reception, received)
-            _take_received(reception, received, attempts)
+            _take_received(reception, received, attempts, presence)
             reception.turn()
             for way_in in ways_in:
                 while way_in.alarms:
@@ -290,12 +290,15 @@ def _requeue(reception: Reception, received: "SimpleQueue[Path]") -> int:
     return len(left_over)
 
 
-def _take_received(reception: Reception, received: "SimpleQueue[Path]", attempts: Attempts) -> None:
+def _take_received(
+    reception: Reception, received: "SimpleQueue[Path]", attempts: Attempts, presence: Presence
+) -> None:
     """Wait for at most one poll, then take whatever is there."""
     try:
         path = received.get(timeout=_POLL_S)
         while True:
             _take(reception, path, attempts)
+            presence.beat()
             path = received.get_nowait()
     except Empty:
         return

@@ -65,8 +65,8 @@ class ScannerClocks:
         if abs(drift.moved_s) <= self._rules.drift_alarm_s:
             return ""
         return (
-            f"slices seem to take {drift.moved_s:+.1f} s longer to come than at the beginning, or "
-            "its clock has drifted by that"
+            f"slices seem to take {drift.moved_s:+.1f} s longer to arrive than at the beginning, "
+            "or its clock has drifted by that much"
         )
 
     def _standing_alarm(self, kind: str, scanner: str, text: str) -> list[tuple[str, str]]:

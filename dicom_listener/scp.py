@@ -274,9 +274,7 @@ class Scp:
             mend_store_request(message, syntax)
             message.message_to_primitive()
         except Exception as error:
-            association.dul.socket.note_ending(
-                "unreadable", f"a message that cannot be read: {error}"
-            )
+            association.dul.socket.note_ending("unreadable", f"an unreadable message: {error}")
             association.dul.event_queue.put("Evt19")
 
     def _on_echo(self, event: Event) -> int:
@@ -313,7 +311,7 @@ class Scp:
         data_set = event.encoded_dataset(include_meta=False)
         if len(data_set) > self._rules.max_object_bytes:
             limit_mib = self._rules.max_object_bytes // 2**20
-            return OUT_OF_RESOURCES, f"object over the limit of {limit_mib} MiB"
+            return OUT_OF_RESOURCES, f"object larger than the limit of {limit_mib} MiB"
         request, association = event.request, event.assoc
         sop_class = str(request.AffectedSOPClassUID or "")
         transfer_syntax = str(event.context.transfer_syntax)
@@ -322,7 +320,7 @@ class Scp:
         except NoDataSetError as error:
             return CANNOT_UNDERSTAND, str(error)
         if peeked.sop_class_uid and peeked.sop_class_uid != sop_class:
-            return DOES_NOT_MATCH_SOP_CLASS, "the data set is of another SOP class"
+            return DOES_NOT_MATCH_SOP_CLASS, "the data set has a different SOP class"
         envelope = Envelope(
             calling_ae_title=str(association.requestor.ae_title).strip(),
             called_ae_title=str(association.acceptor.ae_title).strip(),

@@ -30,8 +30,8 @@ def take_study(record: CaseRecord, home: Path, study: str, who: str) -> None:
     binding = recorded_binding(record)
     if binding is not None and binding.patient and whose.patient not in ("", binding.patient):
         raise TakingError(
-            "These slices are of another patient than the open case: finish it and begin "
-            "another one for them."
+            "These slices belong to a different patient from the open case: finish it and start "
+            "a new case for them."
         )
     with record.transaction():
         if binding is None:
@@ -49,7 +49,7 @@ def _waiting(home: Path, study: str) -> HeldStudy:
                     return waiting
     except CaseRecordError as error:
         raise TakingError(f"The holding area cannot be read: {error}.") from error
-    raise TakingError(f"There is nothing of the study {study[:64]!r} in the holding area.")
+    raise TakingError(f"There are no slices of study {study[:64]!r} in the holding area.")
 
 
 def accept_frame(record: CaseRecord, who: str) -> None:
@@ -60,6 +60,6 @@ def accept_frame(record: CaseRecord, who: str) -> None:
     binding = recorded_binding(record)
     frame = "" if aside is None else str(aside.header["frame_of_reference_uid"])
     if aside is None or binding is None or frame == binding.frame_of_reference:
-        raise TakingError("No slice was set aside for another frame of reference.")
+        raise TakingError("No slice was set aside for a different frame of reference.")
     whose = Identity(binding.patient, str(aside.header["study_instance_uid"]), frame)
     record.append_event(ACCEPTED, event_body(whose), source=_SOURCE, who=who)

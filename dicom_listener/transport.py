@@ -97,10 +97,10 @@ class BoundedSocket(AssociationSocket):
         try:
             return sock.recv(min(_CHUNK_BYTES, nr_bytes))
         except TimeoutError:
-            self.note_ending("stalled", f"nothing more came of a PDU for {sock.gettimeout():g} s")
+            self.note_ending("stalled", f"no more of a PDU arrived for {sock.gettimeout():g} s")
             raise
         except OSError as error:
-            self.note_ending("broken", f"the connection broke ({error.strerror or error})")
+            self.note_ending("broken", f"the connection was broken ({error.strerror or error})")
             raise
 
     def _shutdown_socket(self) -> None:
@@ -113,7 +113,7 @@ class BoundedSocket(AssociationSocket):
     def _check_size(self, nr_bytes: int) -> None:
         self.message_bytes += nr_bytes
         if nr_bytes > self.max_pdu_bytes:
-            self._refuse(f"a PDU of {nr_bytes} bytes, {self.max_pdu_bytes} are allowed")
+            self._refuse(f"a PDU of {nr_bytes} bytes ({self.max_pdu_bytes} allowed)")
         if self.message_bytes > self.max_message_bytes:
             self._refuse(f"a message of more than {self.max_message_bytes} bytes")
 
@@ -177,7 +177,7 @@ class PatienceTimer(SteadyTimer):
     def expired(self) -> bool:
         is_over = super().expired
         if is_over:
-            self._sock.note_ending("idle", f"nothing came for {self.timeout:g} s")
+            self._sock.note_ending("idle", f"nothing arrived for {self.timeout:g} s")
         return is_over
 
 
@@ -224,7 +224,7 @@ def _tolerant(
             if stream[0] == _ABORT:
                 sock.note_ending("aborted", "aborted by the sender")
         except Exception as error:
-            sock.note_ending("unreadable", f"a PDU that cannot be read: {error}")
+            sock.note_ending("unreadable", f"an unreadable PDU: {error}")
             account()
             raise
         return pdu, event
@@ -281,7 +281,7 @@ class PromptServer(ThreadedAssociationServer):
         peer = client_address[0]
         gone = self._lobby.enter(request, peer, is_known=self.is_known(peer))
         if gone is not None:
-            self.on_dropped(gone, "too many connections that say nothing")
+            self.on_dropped(gone, "too many silent connections")
         super().process_request(request, client_address)
 
     def process_request_thread(self, request: Any, client_address: Any) -> None:
@@ -326,7 +326,7 @@ class PromptServer(ThreadedAssociationServer):
         longest = max(silent, key=lambda a: silent[a])
         if silent[longest] < _MAY_BE_SILENT_S:
             return  # all of them are at work: the new one is refused, and says so
-        longest.dul.socket.note_ending("made_room", f"silent, and {peer} wants in")
+        longest.dul.socket.note_ending("made_room", f"silent while {peer} is waiting")
         with contextlib.suppress(Exception):  # it may end by itself in this very moment
             longest.abort()
 

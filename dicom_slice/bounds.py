@@ -109,14 +109,14 @@ class _Walk:
                 break
             at = following
             if len(self._ends) > 2 * DEEPEST:
-                return f"sequences within sequences, more than {DEEPEST} deep"
+                return f"sequences nested more than {DEEPEST} deep"
             if self._items > MOST_ITEMS:
-                return f"more than {MOST_ITEMS} items of sequences"
+                return f"more than {MOST_ITEMS} sequence items"
             if self._elements > MOST_ELEMENTS:
                 return f"more than {MOST_ELEMENTS} elements"
         header_bytes = min(at, size) - start
         if header_bytes > MOST_HEADER_BYTES:
-            return f"{header_bytes // 2**20} MiB beside the pixels"
+            return f"{header_bytes // 2**20} MiB besides the pixels"
         return ""
 
     def _step(self, at: int) -> int | None:

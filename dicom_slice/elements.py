@@ -39,7 +39,7 @@ class Elements:
             if text is None:
                 self.warnings.append(f"{_name(key)} cannot be read ({_one_line(error)})")
                 return None
-            self.warnings.append(f"{_name(key)} is not as its VR wants it: {text[:32]!r}")
+            self.warnings.append(f"{_name(key)} does not match its VR: {text[:32]!r}")
             return text.split("\\") if "\\" in text else text
         if value is None or (hasattr(value, "__len__") and len(value) == 0):
             return None

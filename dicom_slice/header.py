@@ -185,9 +185,9 @@ def _slices_of(data_set: Dataset, times: TimeFrame, noted: list[str]) -> list[Sl
         raise UnusableError(Reason.NO_PIXELS, "no pixels: Rows and Columns are missing")
     n_frames = top.integer("NumberOfFrames") or 1
     if not (0 < rows <= _LARGEST_SIDE_PX and 0 < cols <= _LARGEST_SIDE_PX):
-        raise UnusableError(Reason.TOO_LARGE, f"absurd size: {rows} x {cols} pixels")
+        raise UnusableError(Reason.TOO_LARGE, f"implausible size: {rows} x {cols} pixels")
     if not 0 < n_frames <= _MOST_FRAMES:
-        text = f"{n_frames} frames, 1 to {_MOST_FRAMES} are taken"
+        text = f"{n_frames} frames, 1 to {_MOST_FRAMES} are accepted"
         raise UnusableError(Reason.TOO_LARGE, text)
     return [_slice(top, frame, n_frames, (rows, cols), times) for frame in range(n_frames)]
 
@@ -199,7 +199,7 @@ def _check_is_mr(sop_class: str, modality: str) -> None:
         return
     if sop_class.startswith("1.2.840.10008.5.1.4.1.1.7"):
         raise UnusableError(Reason.SCREEN_SAVE, "a secondary capture (screen save), not MR data")
-    what = modality or sop_class or "an object without modality"
+    what = modality or sop_class or "an object without a modality"
     raise UnusableError(Reason.NOT_MR, f"not an MR image but {what}")
 
 

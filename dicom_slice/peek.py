@@ -64,7 +64,7 @@ def _walk(head: bytes, size: int, order: str, explicit: bool) -> dict[tuple[int,
             raise NoDataSetError(f"({tag[0]:04X},{tag[1]:04X}) cannot stand at byte {at}")
         length, value_at = _length(head, at, order, explicit)
         if length != 0xFFFFFFFF and value_at + length > size:
-            raise NoDataSetError(f"the element at byte {at} ends beyond the data set")
+            raise NoDataSetError(f"the element at byte {at} extends past the end of the data set")
         if tag > _SOP_INSTANCE or length == 0xFFFFFFFF:
             break
         if tag in (_SOP_CLASS, _SOP_INSTANCE):
@@ -79,7 +79,7 @@ def _length(head: bytes, at: int, order: str, explicit: bool) -> tuple[int, int]
         return struct.unpack_from(order + "L", head, at + 4)[0], at + 8
     vr = head[at + 4 : at + 6]
     if vr not in _VRS:
-        raise NoDataSetError(f"{vr!r} at byte {at + 4} is no value representation")
+        raise NoDataSetError(f"{vr!r} at byte {at + 4} is not a value representation")
     if vr not in _LONG_VRS:
         return struct.unpack_from(order + "H", head, at + 6)[0], at + 8
     if at + 12 > len(head):

@@ -73,10 +73,10 @@ def _stored(data_set: FileDataset, top: Elements, frame: int) -> NDArray[np.inte
         raise UnusableError(Reason.COLOUR, "a colour image, not magnitudes")
     frames = top.integer("NumberOfFrames") or 1
     if not 0 <= frame < frames:
-        raise UnusableError(Reason.NO_PIXELS, f"there is no frame {frame}; the file has {frames}")
+        raise UnusableError(Reason.NO_PIXELS, f"no frame {frame}; the file has {frames}")
     rows, cols = top.integer("Rows") or 0, top.integer("Columns") or 0
     if not 0 < rows * cols * 8 <= _MOST_PIXEL_BYTES:
-        raise UnusableError(Reason.UNREADABLE, f"absurd size: {rows} x {cols} pixels")
+        raise UnusableError(Reason.UNREADABLE, f"implausible size: {rows} x {cols} pixels")
     try:
         pixels = pixel_array(data_set, index=frame, raw=True)
     except (KeyboardInterrupt, SystemExit):
@@ -86,7 +86,7 @@ def _stored(data_set: FileDataset, top: Elements, frame: int) -> NDArray[np.inte
         raise UnusableError(Reason.UNDECODABLE, f"pixels cannot be decoded ({text})") from error
     if pixels.shape != (rows, cols):
         raise UnusableError(
-            Reason.UNDECODABLE, f"decoded to {pixels.shape}, the header says {(rows, cols)}"
+            Reason.UNDECODABLE, f"decoded to {pixels.shape}, but the header says {(rows, cols)}"
         )
     return pixels
 

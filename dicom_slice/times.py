@@ -184,7 +184,7 @@ def _instant(text: str, top: Elements, times: TimeFrame) -> float:
             sign = mark
     body = body.strip()
     if len(re.split("[.,]", body)[0]) < 14:
-        raise ImplausibleTimeError(f"{text!r} does not give date and time to the second")
+        raise ImplausibleTimeError(f"{text!r} does not give the date and time to the second")
     local = _local(body[:8], body[8:])
     zone = _offset_zone(sign + offset, local, times) if sign else _header_zone(top, local, times)
     return _epoch_s(local, zone, times)
@@ -205,7 +205,7 @@ def _date_and_time(date: str, time: str, top: Elements, times: TimeFrame) -> flo
         except ImplausibleTimeError as error:  # a clock skips an hour in spring, on one day of them
             problem = error
     if not candidates:
-        raise problem or ImplausibleTimeError(f"{time!r} is no time")
+        raise problem or ImplausibleTimeError(f"{time!r} is not a time")
     # The scanner's clock may run ahead of ours by a little, hardly by half a day.
     return min(candidates, key=lambda s: abs(s - times.received_s))  # type: ignore[operator]
 
@@ -242,7 +242,7 @@ def _offset_zone(text: str, local: datetime, times: TimeFrame) -> tzinfo:
     """The zone of an offset; one without a sign is read if the scanner's own zone has it."""
     found = _ZONE.fullmatch(text.strip())
     if not found or not int(found[2]) <= _MOST_HOURS or not int(found[3]) < 60:
-        raise ImplausibleTimeError(f"{text!r} is no offset from UTC")
+        raise ImplausibleTimeError(f"{text!r} is not an offset from UTC")
     offset = timedelta(hours=int(found[2]), minutes=int(found[3]))
     if found[1] or not offset:
         return timezone(-offset if found[1] == "-" else offset)
@@ -250,7 +250,9 @@ def _offset_zone(text: str, local: datetime, times: TimeFrame) -> tzinfo:
     for signed in (offset, -offset):
         if there.utcoffset() == signed:
             return timezone(signed)
-    raise ImplausibleTimeError(f"{text!r} has no sign, and is not the offset of the room's zone")
+    raise ImplausibleTimeError(
+        f"{text!r} has no sign and is not the offset of the room's time zone"
+    )
 
 
 def _epoch_s(local: datetime, zone: tzinfo | None, times: TimeFrame) -> float:

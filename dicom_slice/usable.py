@@ -52,7 +52,7 @@ def why_not_usable(slice_: Slice, rules: SliceRules) -> SetAside | None:
 
 def _wrong_pixels(slice_: Slice, rules: SliceRules) -> SetAside | None:
     if slice_.samples_per_pixel != 1:
-        return SetAside(Reason.COLOUR, f"{slice_.samples_per_pixel} samples a pixel: colour")
+        return SetAside(Reason.COLOUR, f"{slice_.samples_per_pixel} samples per pixel: colour")
     rows, cols = slice_.shape
     if rules.most_pixels is not None and rows * cols > rules.most_pixels:
         text = f"{rows} x {cols} pixels, at most {rules.most_pixels} are used"
@@ -67,7 +67,7 @@ def _wrong_kind(slice_: Slice, rules: SliceRules) -> SetAside | None:
     if slice_.kind is Kind.CAMERA:
         if rules.allow_camera:
             return None
-        text = "a camera's picture; [listener] camera_slices = true lets them count"
+        text = "a camera's picture; [listener] camera_slices = true accepts them"
         return SetAside(Reason.NOT_MR, text)
     if slice_.is_mosaic:
         return SetAside(Reason.MOSAIC, f"a mosaic of several slices ({image_type})")

@@ -29,8 +29,8 @@ This page is written by `python docs/make_configuration.py` from the models them
 _BRIDGE = """
 ## `[bridge]` and `[[bridge.axis]]`
 
-Read by the daemon in the scanner room (`robot_bridge/daemon/config.py`), which has few packages and checks
-the table by itself. Travel limits have no default on purpose.
+Read by the daemon in the scanner room (`robot_bridge/daemon/config.py`), which has few dependencies and
+checks the table itself. Travel limits deliberately have no default.
 
 | key | default | meaning |
 | --- | --- | --- |
@@ -38,26 +38,26 @@ the table by itself. Travel limits have no default on purpose.
 | `link_baud` | 115200 | Speed of that line. |
 | `state_dir` | required | Folder of the journal, relative to the file; must survive a restart. |
 | `status_file` | `state_dir`/bridge_status.json | Health, rewritten as the bridge runs. |
-| `heartbeat_s`, `deadman_s` | 0.2, 1.0 | Silence of the service longer than the deadman stops all motion. |
+| `heartbeat_s`, `deadman_s` | 0.2, 1.0 | Silence from the service for longer than the deadman stops all motion. |
 | `motion_timeout_s` | 60 | A motion that lasts longer is stopped. |
-| `motion_poll_s` | 0.02 | How often the controllers are asked during a motion. |
+| `motion_poll_s` | 0.02 | How often the controllers are polled during a motion. |
 | `controller_baud`, `controller_timeout_s` | 115200, 0.1 | The line to the controllers. |
-| `controller_response_delay_us` | 20 | Their pause before an answer; more behind a fibre converter. |
+| `controller_response_delay_us` | 20 | Their pause before a response; longer behind a fibre converter. |
 | `park_after_move` | false | Park the drives after every move (a powered drive costs SNR). |
 | `guardian` | true | A second process that stops the motors if the daemon is killed. |
 | `capture_file` | none | Every byte to and from the controllers. |
 | `service_link` | none | The service's end of the line, for `autospine robot`; else `[service] bridge_link`. |
 | axis `name` | required | `xt`, `yt` (top stage), `xb`, `yb` (bottom stage). |
 | axis `controller`, `address` | required | Serial device (`/dev/serial/by-id/...`) and address. |
-| axis `serial_number` | none | Of the board (Y42); else the one that answered first is remembered. |
+| axis `serial_number` | none | Of the board (Y42); absent: the one that answers first is remembered. |
 | axis `drive` | required | `open_loop` (steps) or `closed_loop` (encoder). |
 | axis `travel_min_mm`, `travel_max_mm` | required | Both ends allowed. |
-| axis `sign` | required | 1 or -1: whether the axis grows when the controller runs forward. |
-| axis `speed_hz` | 400 | wfm-steps a second, capped by the controller's own limit. |
+| axis `sign` | required | 1 or -1: whether the position increases when the controller runs forward. |
+| axis `speed_hz` | 400 | wfm-steps per second, capped by the controller's own limit. |
 | axis `step_um_forward`, `step_um_reverse` | required open loop | From `autospine robot calibrate-steps`. |
-| axis `step_error` | 0.05 | How wrong these may be; the bound of a counted position grows by it. |
+| axis `step_error` | 0.05 | Relative error of these; the bound of a counted position grows by it. |
 | axis `approach_um` | 0 | Overshoot so that every position is reached from the same side. |
-| axis `tolerance_um` | 20 | How near counts as there; an axis that near is not moved. |
+| axis `tolerance_um` | 20 | An axis this close to its setpoint counts as there and is not moved. |
 | axis `counts_per_mm`, `tolerance_counts`, `encoder_type` | closed loop | The encoder; type is Y13. |
 | axis `encoder_direction` | flash | Y6, from `autospine robot find-encoder`. |
 | axis `home_mm` | none | Where the reference lies. |

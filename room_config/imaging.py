@@ -17,12 +17,12 @@ class PointSpreadConfig(Section):
     parameters: tuple[float, ...] = Field(
         default=(),
         description="hamming: alpha; fermi: cutoff and width, in units of the highest frequency; "
-        "empty: the usual ones.",
+        "empty: the usual values.",
     )
     acquired: tuple[Fraction, Fraction] = Field(
         default=(1.0, 1.0),
-        description="Share of k-space (along rows, along columns) that is really sampled, where "
-        "the scanner fills the rest with zeros.",
+        description="Fraction of k-space (along rows, along columns) that is actually sampled, "
+        "where the scanner zero-fills the rest.",
     )
 
     @model_validator(mode="after")
@@ -41,8 +41,8 @@ class ImagingConfig(Section):
     )
     distortion_corrected: bool | None = Field(
         default=None,
-        description="Use only slices with (true) or only those without (false) the scanner's "
-        "distortion correction; absent: as the first slice used in a case.",
+        description="Use only slices with (true) or without (false) the scanner's distortion "
+        "correction; absent: as in the first slice used in a case.",
     )
     fiducial_radius_min_mm: float = Field(
         default=2.5, gt=0, description="Smallest radius at which the fiducial may appear."
@@ -52,23 +52,23 @@ class ImagingConfig(Section):
     )
     start_region_px: tuple[float, float, float, float] | None = Field(
         default=None,
-        description="Row and column bounds (r0, c0, r1, c1) in which the fiducial is looked for "
-        "while nothing is known of its position; absent: the whole slice.",
+        description="Row and column bounds (r0, c0, r1, c1) of the search for the fiducial while "
+        "its position is unknown; absent: the whole slice.",
     )
     position_gate_mm: float = Field(
         default=3.0,
         gt=0,
-        description="A fiducial further than this from its predicted position is not believed.",
+        description="A fiducial farther than this from its predicted position is refused.",
     )
     point_spread: PointSpreadConfig | None = Field(
         default=None,
-        description="The filter of the slices; absent: recognised for each series in the noise of "
-        "its first slice.",
+        description="The filter of the slices; absent: recognised for each series from the noise "
+        "of its first slice.",
     )
     readout_polarity: Literal[-1, 0, 1] = Field(
         default=0,
-        description="Where oil appears: 1 displaced towards growing pixel indices along the "
-        "readout, -1 towards shrinking ones, 0 not known; needed for targets in tissue.",
+        description="Where oil appears: 1 displaced towards higher pixel indices along the "
+        "readout, -1 towards lower ones, 0 unknown; needed for targets in tissue.",
     )
 
     @model_validator(mode="after")

@@ -12,33 +12,38 @@ class ListenerConfig(Section):
     port: int = Field(default=11112, ge=0, le=65535, description="0: any free port.")
     ae_title: str = Field(default="AUTOSPINE", min_length=1, max_length=16)
     require_called_ae_title: bool = Field(
-        default=True, description="True: refuse associations that call another AE title."
+        default=True, description="True: refuse associations that call a different AE title."
     )
     calling_ae_titles: tuple[str, ...] = Field(
-        default=(), description="AE titles that may send; none listed: any."
+        default=(), description="AE titles that may send; empty: any."
     )
     peer_networks: tuple[str, ...] = Field(
-        default=(), description="Addresses or CIDR networks that may send; none listed: any."
+        default=(), description="Addresses or CIDR networks that may send; empty: any."
     )
     any_storage_class: bool = Field(
         default=True,
-        description="True: store every kind of object and set aside what is no MR image; "
-        "False: refuse it at negotiation.",
+        description="True: store every kind of object and set aside what is not an MR image; "
+        "false: refuse it at negotiation.",
     )
     max_associations: int = Field(default=16, ge=1, le=256)
-    acse_timeout_s: float = Field(default=10.0, gt=0, description="To open an association.")
-    dimse_timeout_s: float = Field(default=30.0, gt=0, description="Between parts of a message.")
+    acse_timeout_s: float = Field(
+        default=10.0, gt=0, description="Time allowed to open an association."
+    )
+    dimse_timeout_s: float = Field(
+        default=30.0, gt=0, description="Time allowed between parts of a message."
+    )
     network_timeout_s: float = Field(
         default=900.0,
         gt=0,
-        description="An association on which nothing arrives between messages is ended: longer "
-        "than scanners pause that keep one open.",
+        description="An association idle for this long between messages is ended; must exceed "
+        "the pauses of scanners that keep an association open.",
     )
     max_object_mib: int = Field(default=512, ge=1, description="Largest object that is stored.")
     min_free_mib: int = Field(
         default=1024,
         ge=0,
-        description="Below this much free disk slices are refused (0xA700); alarm at twice that.",
+        description="Below this much free disk space slices are refused (0xA700); the alarm "
+        "comes at twice that.",
     )
     tls_certificate: Path | None = Field(
         default=None, description="PEM file; with tls_key and tls_authority: mutual TLS."
@@ -49,40 +54,41 @@ class ListenerConfig(Section):
     )
     watch_dir: Path | None = Field(
         default=None,
-        description="A folder (share) to which the scanner's console writes slices: a second way "
-        "in. It is only read.",
+        description="A folder (share) to which the scanner console writes slices, as a second "
+        "input. It is only read.",
     )
     scanner_time_zone: str = Field(
         default="",
-        description="IANA name of the zone of scanners that do not say; empty: this computer's.",
+        description="IANA time zone of scanners that do not state theirs; empty: this computer's.",
     )
     guard_s: float = Field(
         default=0.05,
         ge=0,
-        description="A hold is shrunk by this at both ends before a slice may belong to it.",
+        description="A hold is shortened by this at both ends before a slice may belong to it.",
     )
     prompt_delay_s: float | None = Field(
         default=None,
         gt=0,
-        description="No slice arrives later than this after its acquisition ended, as measured at "
-        "this site (`autospine commission`). Absent: not measured, and nothing is believed of it.",
+        description="No slice arrives later than this after the end of its acquisition, as "
+        "measured at this site (`autospine commission`). Absent: not measured, and nothing "
+        "is assumed.",
     )
     least_delay_s: float = Field(
         default=0.0,
         ge=0,
-        description="No slice arrives sooner than this after its acquisition ended, measured with "
-        "prompt_delay_s.",
+        description="No slice arrives sooner than this after the end of its acquisition, as "
+        "measured together with prompt_delay_s.",
     )
     longest_acquisition_s: float = Field(
         default=30.0,
         gt=0,
-        description="No acquisition lasts longer that comes without its duration; a slice without "
-        "one is used only after the robot has stood that long.",
+        description="Longest acquisition of a slice that does not state its duration; such a "
+        "slice is used only after the robot has stood still for that long.",
     )
     late_limit_s: float = Field(
         default=120.0,
         gt=0,
-        description="A slice that seems later than this is set aside: its clock may have jumped.",
+        description="A slice that appears later than this is set aside: its clock may have jumped.",
     )
     clock_offset_s: float | None = Field(
         default=None, description="A comparison of the clocks: ours minus the scanner's."
@@ -98,28 +104,33 @@ class ListenerConfig(Section):
     comparison_valid_min: float = Field(
         default=60.0,
         gt=0,
-        description="A comparison of the clocks counts for so long; after it slices wait until "
-        "somebody compares again. A scanner that says that its clock is synchronized is exempt.",
+        description="How long a comparison of the clocks is valid; after that slices are pending "
+        "until the clocks are compared again. A scanner that states that its clock is "
+        "synchronized is exempt.",
     )
     arrival_mode: bool = Field(
         default=False,
-        description="True: no usable acquisition times here; the operator confirms each "
+        description="True: acquisition times are unusable here; the operator confirms each "
         "acquisition, and every result is marked.",
     )
     allow_derived: bool = Field(default=False, description="True: use derived images too.")
     camera_slices: bool = Field(
-        default=False, description="True: slices of a bench camera (`autospine camera`) count too."
+        default=False,
+        description="True: slices of a bench camera (`autospine camera`) are used, too.",
     )
     metrics_port: int | None = Field(
-        default=None, ge=0, le=65535, description="Serve /metrics on localhost; absent: do not."
+        default=None,
+        ge=0,
+        le=65535,
+        description="Port for /metrics on localhost; absent: not served.",
     )
     commitment_reports_to: dict[str, str] = Field(
         default={},
-        description='AE title = "host:port" of consoles that ask for Storage Commitment and want '
-        "the report on an association of its own.",
+        description='AE title = "host:port" of consoles that request Storage Commitment and want '
+        "the report on a separate association.",
     )
     retention_days: float = Field(
-        default=0.0, ge=0, description="Remove set-aside files after so many days; 0: keep all."
+        default=0.0, ge=0, description="Delete set-aside files after this many days; 0: keep all."
     )
 
     @model_validator(mode="after")
@@ -127,7 +138,7 @@ class ListenerConfig(Section):
         if self.prompt_delay_s is None and self.least_delay_s:
             raise ValueError("least_delay_s is measured with prompt_delay_s: give both")
         if self.prompt_delay_s is not None and not self.least_delay_s <= self.prompt_delay_s:
-            raise ValueError("least_delay_s must not be more than prompt_delay_s")
+            raise ValueError("least_delay_s must not exceed prompt_delay_s")
         return self
 
     @model_validator(mode="after")

@@ -17,13 +17,13 @@ class OpenIgtLinkConfig(Section):
     host: str = Field(default="127.0.0.1", description="Address to listen on.")
     peer_networks: tuple[str, ...] = Field(
         default=(),
-        description="Addresses or CIDR networks that may connect. OpenIGTLink knows no login: "
-        "needed where host is not loopback.",
+        description="Addresses or CIDR networks that may connect. OpenIGTLink has no login: "
+        "required unless host is loopback.",
     )
     inwards: bool = Field(
         default=False,
-        description="Answer queries of peers, and put their targets and entry points before the "
-        "operator. STOP and EMERGENCY are heeded from every peer, also where this is off.",
+        description="Answer queries from peers, and propose their targets and entry points to "
+        "the operator. STOP and EMERGENCY are obeyed from every peer even if this is off.",
     )
     max_receivers: int = Field(default=8, ge=1, le=64)
 
@@ -33,7 +33,7 @@ class OpenIgtLinkConfig(Section):
             ipaddress.ip_network(network)
         if self.port is not None and not self.peer_networks and not _is_loopback(self.host):
             raise ValueError(
-                f"peer_networks must say who may connect, as host {self.host} is not loopback"
+                f"peer_networks must list who may connect, because host {self.host} is not loopback"
             )
         return self
 

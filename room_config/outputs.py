@@ -17,18 +17,22 @@ class Destination(Section):
         min_length=1,
         max_length=32,
         pattern=r"^[A-Za-z0-9 ._-]+$",
-        description="How it is called on the page, in the log and in the outbox.",
+        description="Its name on the page, in the log and in the outbox.",
     )
     host: str = Field(min_length=1, description="Name or address of the computer.")
     port: int = Field(ge=1, le=65535, description="Its DICOM port.")
     ae_title: str = Field(min_length=1, max_length=16, description="Its AE title.")
     calling_ae_title: str = Field(
-        default="AUTOSPINE", min_length=1, max_length=16, description="The AE title that we show."
+        default="AUTOSPINE",
+        min_length=1,
+        max_length=16,
+        description="The AE title that we present.",
     )
     kinds: tuple[OutputKind, ...] = Field(
         default=("image", "report", "presentation"),
         min_length=1,
-        description="What it gets: `image` (derived MR image of every reconstruction), `report` "
+        description="What it receives: `image` (derived MR image of every reconstruction), "
+        "`report` "
         "(measurement report of every READY and every puncture), `presentation` (presentation "
         "state of every READY); and, where it is asked for, `plan` (target and entry point as "
         "Spatial Fiducials, whenever they change).",
@@ -55,23 +59,25 @@ class Destination(Section):
 
 class OutputsConfig(Section):
     timeout_s: float = Field(
-        default=30.0, gt=0, description="To reach a destination, and for each of its answers."
+        default=30.0,
+        gt=0,
+        description="Time allowed to reach a destination, and for each of its responses.",
     )
     retry_s: float = Field(
-        default=2.0, gt=0, description="First wait before something is sent again; then doubled."
+        default=2.0, gt=0, description="First wait before sending again; doubled each time."
     )
     longest_retry_s: float = Field(
-        default=120.0, gt=0, description="No wait is longer. What was refused waits that long."
+        default=120.0, gt=0, description="Longest wait. Refused objects wait this long."
     )
     alarm_after_s: float = Field(
         default=60.0,
         ge=0,
-        description="A destination that cannot be reached for so long is an alarm.",
+        description="A destination unreachable for this long raises an alarm.",
     )
     destination: list[Destination] = Field(
         default=[],
-        description="Who gets what, one [[outputs.destination]] table each. Without any nothing "
-        "is sent and nothing is written for it.",
+        description="Who receives what, one [[outputs.destination]] table each. Without any, "
+        "nothing is sent or prepared for sending.",
     )
 
     @model_validator(mode="after")

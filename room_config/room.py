@@ -11,13 +11,13 @@ class RoomConfig(Section):
     name: str = Field(min_length=1, description="Shown on the page and in reports.")
     cases_dir: Path | None = Field(
         default=None,
-        description="Folder of the room's cases, relative to this file: each case begins and ends "
-        "on the page and has a folder of its own here. Either this or `case_dir`.",
+        description="Folder of the room's cases, relative to this file: each case is started and "
+        "finished on the page and has its own folder here. Give either this or `case_dir`.",
     )
     case_dir: Path | None = Field(
         default=None,
-        description="Folder of the one case of a room that has a single one (a bench, a "
-        "rehearsal); relative to this file.",
+        description="Folder of the only case of a room that has just one (a bench, a rehearsal); "
+        "relative to this file.",
     )
     virtual: bool = Field(
         default=False, description="True: no patient, no robot; the page shows a banner."
@@ -31,7 +31,7 @@ class RoomConfig(Section):
     @model_validator(mode="after")
     def _one_of_two(self) -> "RoomConfig":
         if self.cases_dir is None and self.case_dir is None:
-            raise ValueError("cases_dir is missing: the folder in which the room's cases lie")
+            raise ValueError("cases_dir is missing: the folder that holds the room's cases")
         if self.cases_dir is not None and self.case_dir is not None:
             raise ValueError("cases_dir and case_dir exclude each other: leave case_dir out")
         return self

@@ -26,7 +26,7 @@ def checked_public_url(text: str) -> str:
     parts = urlsplit(text)
     _ = parts.port  # ValueError of its own if it is no number
     if parts.scheme not in ("http", "https") or not parts.hostname:
-        raise ValueError(f"{text!r} is no address like https://navigator.example.org/")
+        raise ValueError(f"{text!r} is not an address like https://navigator.example.org/")
     if parts.query or parts.fragment or parts.username:
         raise ValueError(f"{text!r} must be scheme, host, port and path only")
     return f"{parts.scheme}://{parts.netloc}{parts.path.rstrip('/')}/"
@@ -39,14 +39,14 @@ class AccessToken(Section):
         min_length=1,
         max_length=64,
         pattern=r"^[^\x00-\x1f\x7f]+$",
-        description="Who; this stands in the record with every action.",
+        description="Name; recorded with every action.",
     )
     role: Literal["viewer", "operator"] = Field(
         description="A viewer may look and press STOP; an operator may do everything."
     )
     sha256: str = Field(pattern=r"^[0-9a-f]{64}$", description="Hash of the token, hexadecimal.")
     expires: date | None = Field(
-        default=None, description="Last day (UTC) on which the token is good; absent: no end."
+        default=None, description="Last day (UTC) on which the token is valid; absent: no expiry."
     )
 
     def has_expired(self, wall_s: float) -> bool:
@@ -91,19 +91,19 @@ class GuideConfig(Section):
     needle_reach_mm: float = Field(
         default=120.0,
         gt=0,
-        description="A target further below the lower ball joint than this is refused.",
+        description="A target farther below the lower ball joint than this is refused.",
     )
     calibration_move_mm: float = Field(
         default=6.0, description="Length of the four calibration moves; the sign is the direction."
     )
     tolerance_mm: float = Field(
-        default=0.25, gt=0, description="READY when the error of the needle's tip is below this."
+        default=0.25, gt=0, description="READY when the error of the needle tip is below this."
     )
 
     @model_validator(mode="after")
     def _fits_together(self) -> "GuideConfig":
         if len(set(self.axes)) != len(self.axes):
-            raise ValueError("axes: four different ones are needed")
+            raise ValueError("axes: four different axes are needed")
         if self.upper_plane_mm == self.lower_plane_mm:
             raise ValueError("upper_plane_mm and lower_plane_mm must differ")
         if not self.upper_fiducial_mm > self.lower_fiducial_mm:
@@ -113,8 +113,8 @@ class GuideConfig(Section):
         upwards = self.upper_plane_mm > self.lower_plane_mm
         if (self.upper_slice_mm > self.lower_slice_mm) != upwards:
             raise ValueError(
-                "upper_slice_mm must lie from lower_slice_mm to the side on which upper_plane_mm "
-                "lies from lower_plane_mm"
+                "upper_slice_mm must be on the same side of lower_slice_mm as upper_plane_mm is "
+                "of lower_plane_mm"
             )
         return self
 
@@ -127,14 +127,14 @@ class ServiceConfig(Section):
     )
     token: list[AccessToken] = Field(
         default=[],
-        description="Who may use the service, one [[service.token]] table each. Without any it "
-        "listens on loopback only and everybody there is an operator.",
+        description="Who may use the service, one [[service.token]] table each. Without any, it "
+        "listens on loopback only and everyone there is an operator.",
     )
     session_hours: float = Field(
         default=12.0, gt=0, le=168, description="A login on the page lasts this long."
     )
     lock_out_after: int = Field(
-        default=5, ge=2, description="So many wrong tokens from one address lock it out."
+        default=5, ge=2, description="This many wrong tokens from one address lock it out."
     )
     lock_out_s: float = Field(default=60.0, gt=0, description="A lock-out lasts this long.")
     tls_certificate: Path | None = Field(
@@ -143,8 +143,8 @@ class ServiceConfig(Section):
     tls_key: Path | None = Field(default=None, description="PEM file of the private key.")
     public_url: str = Field(
         default="",
-        description="What people type to come to the page where a reverse proxy stands in between, "
-        "as https://navigator.example.org/room1/; empty: they come to host and port themselves.",
+        description="The address of the page behind a reverse proxy, such as "
+        "https://navigator.example.org/room1/; empty: host and port are opened directly.",
     )
     camera_preview_url: str = Field(
         default="",
@@ -153,7 +153,7 @@ class ServiceConfig(Section):
     )
     trusted_proxies: list[str] = Field(
         default=["127.0.0.1", "::1"],
-        description="Addresses and networks of the proxies whose X-Forwarded-For says who asks.",
+        description="Addresses and networks of the proxies whose X-Forwarded-For is trusted.",
     )
     heartbeat_s: float = Field(default=0.2, gt=0, le=1)
     axes: list[str] = Field(
@@ -174,18 +174,22 @@ class ServiceConfig(Section):
     )
     tolerance_range_mm: tuple[float, float] = Field(
         default=(0.03, 0.5),
-        description="On the page the tolerance of a case can be set within this.",
+        description="Range in which the page can set the tolerance of a case.",
     )
     confidence_range: tuple[float, float] = Field(
-        default=(0.8, 0.999), description="On the page the confidence of a case can be set so."
+        default=(0.8, 0.999),
+        description="Range in which the page can set the confidence of a case.",
     )
     most_slices: int = Field(
-        default=6, ge=1, le=32, description="Slices at one position at the most, to become sure."
+        default=6,
+        ge=1,
+        le=32,
+        description="Most slices taken at one position to reach the confidence.",
     )
     most_slices_limit: int = Field(
-        default=16, ge=1, le=32, description="On the page that number can be set up to this."
+        default=16, ge=1, le=32, description="Upper limit for that number on the page."
     )
-    max_iterations: int = Field(default=8, ge=1, description="Moves of one approach at the most.")
+    max_iterations: int = Field(default=8, ge=1, description="Most moves in one approach.")
     shift_set: Literal["single", "quarter", "half", "lattice5", "paper"] = Field(
         default="quarter",
         description="Commanded shifts of one measurement when several are needed.",
@@ -194,22 +198,26 @@ class ServiceConfig(Section):
         default=True, description="True: each approach move waits for the operator's CONFIRM MOVE."
     )
     prediction_gate_sigma: float = Field(
-        default=5.0, gt=0, description="Refuse to go on when a move misses its prediction by more."
+        default=5.0,
+        gt=0,
+        description="Refuse to continue when a move misses its prediction by more than this.",
     )
     ready_valid_s: float = Field(
         default=300.0,
         gt=0,
-        description="A measurement, and READY with it, is good for so long: a push of a stage "
-        "without encoder is seen by no sensor. Then it must be measured again.",
+        description="How long a measurement, and READY with it, stays valid: no sensor detects a "
+        "push on a stage without an encoder. After that it must be measured again.",
     )
     settle_s: float = Field(
         default=3.5,
         ge=0,
-        description="Wait so long after a move before slices are asked for; must exceed the "
-        "uncertainty of the scanner's clock, else slices cannot be proved to belong here.",
+        description="Wait after a move before slices are requested; must exceed the uncertainty "
+        "of the scanner's clock, or slices cannot be proved to belong to the hold.",
     )
     rescan_after_s: float = Field(
-        default=60.0, gt=0, description="Ask for the slices again when none came for so long."
+        default=60.0,
+        gt=0,
+        description="Request the slices again when none has arrived for this long.",
     )
     repeatability_um: float = Field(
         default=14.0, gt=0, description="Standard deviation of one axis after one move."
@@ -245,14 +253,14 @@ class ServiceConfig(Section):
             raise ValueError("tls_certificate and tls_key go together")
         if self.public_url and not self.token and not is_loopback(urlsplit(self.public_url)):
             raise ValueError(
-                "public_url: others can reach the page by it: add [[service.token]] tables "
+                "public_url makes the page reachable by others: add [[service.token]] tables "
                 "(`autospine token NAME` makes one)"
             )
         for name in ("tolerance_range_mm", "confidence_range"):
             low, high = getattr(self, name)
             if not 0 < low <= high:
                 raise ValueError(
-                    f"{name}: the first number must be above 0 and not above the other"
+                    f"{name}: the first number must be above 0 and not above the second"
                 )
         if not 0.5 < self.confidence_range[0] <= self.confidence_range[1] < 1:
             raise ValueError("confidence_range: both must lie between 0.5 and 1")

@@ -66,7 +66,7 @@ def on_parent_gone(end: Callable[[], object]) -> None:
         with contextlib.suppress(OSError):
             while os.read(0, 4096):
                 pass
-        structlog.get_logger().info("the parent process is gone: ending")
+        structlog.get_logger().info("the parent process has ended: exiting")
         end()
 
     threading.Thread(target=wait, name="parent", daemon=True).start()

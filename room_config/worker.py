@@ -7,6 +7,6 @@ from room_config.section import Section
 
 class WorkerConfig(Section):
     poll_s: float = Field(
-        default=0.005, gt=0, le=1, description="How often the record is looked at for new work."
+        default=0.005, gt=0, le=1, description="How often the record is checked for new work."
     )
     reconstruction_factor: int = Field(default=2, ge=2, le=4)

@@ -375,7 +375,7 @@ def _verification(ca: str | Path | None) -> ssl.SSLContext | bool:
     try:
         return ssl.create_default_context(cafile=str(ca))
     except OSError as error:  # ssl.SSLError is one
-        raise OSError(f"{ca}: no certificate authority can be read from it ({error})") from error
+        raise OSError(f"{ca}: no certificate authority could be read from it ({error})") from error
 
 
 def _of_case(case: str | None) -> dict[str, Any]:

@@ -14,6 +14,9 @@ the loopback) takes one request a line and answers one JSON line:
     power-cycle              the controllers lose their supply
     slip AXIS MM             something pushes the stage
     load AXIS FRACTION       load in units of the stall load
+    drives AXIS SHARE…       how far the stage goes for each mm that the motor of each axis drives,
+                             in the order of --axes: 1 for its own and 0 for the others
+    play AXIS MM             backlash between motor and stage
 """
 
 import argparse
@@ -42,6 +45,7 @@ from robot_bridge.emulator.control import (
 from robot_bridge.emulator.line_server import LineServer
 from robot_bridge.emulator.server import EmulatorServer, PseudoTerminal
 from robot_bridge.emulator.switches import Switches
+from simulator.drive_train import DriveTrain
 from simulator.motion_truth import COMMANDED, MotionTruth
 from simulator.stage_physics import PiezoLegsStage, StageParameters
 
@@ -106,6 +110,7 @@ class VirtualMotors:
         for axis in self.axes.values():
             axis.controller.speed_factor = speed_factor
         controllers = [axis.controller for axis in self.axes.values()]
+        self.drive_train = DriveTrain(axes)
         self.bus = EmulatedBus(controllers, switches, random.Random(seed))
         write_state(state_file, positions_mm)
 
@@ -138,7 +143,10 @@ class VirtualMotors:
     def observe(self) -> None:
         """After every step of the emulation: keep the truth and the file up to date."""
         now_s = time.time()
+        for name, astray_mm in self.drive_train.astray_mm(self.positions_mm()).items():
+            self.axes[name].stage.displace(1000.0 * astray_mm)
         positions_mm = self.positions_mm()
+        self.drive_train.stands_at(positions_mm)
         if self.truth.observe(positions_mm, now_s):
             write_state(self._state_file, positions_mm)
         for name, axis in self.axes.items():
@@ -158,6 +166,8 @@ class VirtualMotors:
             "power-cycle": self._power_cycle,
             "slip": self._slip,
             "load": self._load,
+            "drives": self._drives,
+            "play": self._play,
         }
         if word not in handlers:
             raise RequestError(f"unknown request {word!r}; known: {', '.join(handlers)}")
@@ -213,6 +223,17 @@ class VirtualMotors:
 
     def _slip(self, axis: str, distance_mm: str) -> dict[str, object]:
         self._named_axis(axis).stage.displace(float(distance_mm) * 1000.0)
+        self.drive_train.stands_at(self.positions_mm())
+        return {"ok": True}
+
+    def _drives(self, axis: str, *shares: str) -> dict[str, object]:
+        if len(shares) != len(self.axes):
+            raise ValueError(f"there are {len(self.axes)} axes")
+        self.drive_train.shares[self._named_axis(axis).name] = [float(share) for share in shares]
+        return {"ok": True}
+
+    def _play(self, axis: str, play_mm: str) -> dict[str, object]:
+        self.drive_train.play_mm[self._named_axis(axis).name] = float(play_mm)
         return {"ok": True}
 
     def _load(self, axis: str, load: str) -> dict[str, object]:

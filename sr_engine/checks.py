@@ -25,21 +25,23 @@ def checked_frames(frames: ArrayLike) -> Array:
         array = np.asarray(frames, dtype=float)
     except (ValueError, TypeError) as error:
         shapes = [np.shape(f) for f in frames] if np.iterable(frames) else []
-        raise ShapeError(f"frames must be numbers and of one size, have shapes {shapes}") from error
+        raise ShapeError(
+            f"frames must be numeric and of the same size, got shapes {shapes}"
+        ) from error
     if array.ndim == 2:
         array = array[None]
     if array.ndim != 3 or array.shape[0] == 0:
         raise ShapeError(f"expected one frame or a list of frames, got shape {array.shape}")
     if min(array.shape[1:]) < _SMALLEST_FRAME:
         raise ShapeError(
-            f"frames need at least {_SMALLEST_FRAME} pixels along each axis, are {array.shape[1:]}"
+            f"frames need at least {_SMALLEST_FRAME} pixels along each axis, got {array.shape[1:]}"
         )
     for k, frame in enumerate(array):
         if not np.isfinite(frame).all():
             bad = int(np.count_nonzero(~np.isfinite(frame)))
             raise NotFiniteError(f"frame {k} has {bad} pixels that are not finite")
         if np.ptp(frame) == 0:
-            raise ConstantFrameError(f"frame {k} is constant, every pixel is {frame[0, 0]:g}")
+            raise ConstantFrameError(f"frame {k} is constant: every pixel is {frame[0, 0]:g}")
     return array
 
 
@@ -47,7 +49,7 @@ def checked_shifts(shifts_px: ArrayLike | None, n_frames: int) -> Array:
     """Shifts (N, 2) in px, zero for one frame without any."""
     if shifts_px is None:
         if n_frames != 1:
-            raise ShapeError(f"{n_frames} frames need their shifts, none were given")
+            raise ShapeError(f"{n_frames} frames need shifts; none were given")
         return np.zeros((1, 2))
     shifts = np.asarray(shifts_px, dtype=float)
     if shifts.shape != (n_frames, 2):
@@ -66,7 +68,7 @@ def checked_radii(radius_px: tuple[float, float] | float | None) -> tuple[float,
     pair = np.atleast_1d(np.asarray(radius_px, dtype=float))
     low, high = (0.75 * pair[0], 1.25 * pair[0]) if pair.size == 1 else pair
     if not 0 < low < high < np.inf:
-        raise ParameterError(f"radius range must be 0 < low < high, is ({low}, {high}) px")
+        raise ParameterError(f"radius range must be 0 < low < high, got ({low}, {high}) px")
     return float(low), float(high)
 
 
@@ -76,7 +78,7 @@ def checked_point(point_px: ArrayLike | None, name: str) -> tuple[float, float] 
         return None
     point = np.asarray(point_px, dtype=float)
     if point.shape != (2,):
-        raise ShapeError(f"{name} must be (row, col), has shape {point.shape}")
+        raise ShapeError(f"{name} must be (row, col), got shape {point.shape}")
     if not np.isfinite(point).all():
         raise NotFiniteError(f"{name} is not finite: {point}")
     return float(point[0]), float(point[1])
@@ -87,8 +89,8 @@ def refuse_non_square(spacing_mm: tuple[float, float]) -> None:
     between_rows, between_cols = spacing_mm
     if not abs(between_rows / between_cols - 1) <= _SQUARE_WITHIN:
         raise NonSquarePixelsError(
-            f"pixels of {between_rows:g} x {between_cols:g} mm (between rows, between columns) are "
-            "not square: a round object is an ellipse in them"
+            f"pixels of {between_rows:g} x {between_cols:g} mm (between rows, between columns) "
+            "are not square: a round object would appear as an ellipse"
         )
 
 
@@ -105,4 +107,4 @@ def refuse_saturated(values: Array, radius_px: float, level: float | None) -> No
     others = values[values < top]
     noiseless = others.size == 0 or np.unique(others).size < 0.5 * others.size
     if level is not None or not noiseless:
-        raise SaturatedError(f"{at_top} pixels at or near the object stand at {top:g}, the top")
+        raise SaturatedError(f"{at_top} pixels at or near the object are saturated at {top:g}")

@@ -92,7 +92,7 @@ def _resolvable(radii: tuple[float, float]) -> tuple[float, float]:
     if radii[1] <= LEAST_RADIUS_PX:
         raise ParameterError(
             f"round objects of radius {radii[0]:.2f} to {radii[1]:.2f} px cannot be told from "
-            f"other spots; the shape shows from {LEAST_RADIUS_PX:g} px on"
+            f"other spots; shape is visible only from {LEAST_RADIUS_PX:g} px up"
         )
     return max(radii[0], LEAST_RADIUS_PX), radii[1]
 
@@ -105,7 +105,7 @@ def checked_roi(
         return 0, 0, shape[0], shape[1]
     row0, col0, row1, col1 = roi
     if not (0 <= row0 < row1 <= shape[0] and 0 <= col0 < col1 <= shape[1]):
-        raise ShapeError(f"region {roi} is empty or not inside of a frame of {shape}")
+        raise ShapeError(f"region {roi} is empty or not inside a frame of {shape}")
     return row0, col0, row1, col1
 
 

@@ -338,7 +338,7 @@ def _levenberg_marquardt(
             damping *= 10
     if gain < _NEARLY_SETTLED * max(1.0, cost / at.residual.size):
         return parameters, at
-    raise NotConvergedError(f"the fit did not settle in {_MAX_ITERATIONS} iterations")
+    raise NotConvergedError(f"the fit did not converge in {_MAX_ITERATIONS} iterations")
 
 
 def _refuse_vanished(parameters: Array, sigma: float) -> None:
@@ -376,7 +376,7 @@ def _summary(
     low, high = problem.radius_bounds_px
     if not low < parameters[RADIUS] < high:
         raise NotConvergedError(
-            f"the radius ran to the end of its range, {parameters[RADIUS]:.2f} px in "
+            f"the radius reached the end of its range, {parameters[RADIUS]:.2f} px in "
             f"[{low:.2f}, {high:.2f}]"
         )
     at = replace(

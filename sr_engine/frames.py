@@ -26,7 +26,7 @@ def check_frame(frame: ArrayLike, what: str = "the frame") -> NDArray[np.float64
         )
     if not np.isfinite(image).all():
         row, col = (int(i) for i in np.argwhere(~np.isfinite(image))[0])
-        raise NotFiniteError(f"{what} has a value that is not finite at row {row}, col {col}")
+        raise NotFiniteError(f"{what} has a non-finite value at row {row}, col {col}")
     return image
 
 
@@ -76,7 +76,7 @@ def check_shifts(shifts_px: ArrayLike, count: int | None = None) -> NDArray[np.f
 
 def check_factor(factor: int) -> int:
     if isinstance(factor, bool) or factor not in (2, 3, 4):
-        raise ParameterError(f"factor is {factor!r}; 2, 3 or 4 is supported")
+        raise ParameterError(f"factor is {factor!r}; 2, 3 and 4 are supported")
     return int(factor)
 
 

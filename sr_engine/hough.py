@@ -56,7 +56,9 @@ class HoughSettings:
         if not 1.0 <= low < high < math.inf:
             raise ParameterError(f"radius range is {low} to {high} px; 1 <= low < high is needed")
         if not 0.0 < self.sensitivity < 1.0:
-            raise ParameterError(f"sensitivity is {self.sensitivity}; it must lie inside 0 to 1")
+            raise ParameterError(
+                f"sensitivity is {self.sensitivity}; it must lie strictly between 0 and 1"
+            )
         if self.edge_threshold is not None and not 0.0 <= self.edge_threshold < 1.0:
             raise ParameterError(f"edge_threshold is {self.edge_threshold}; 0 <= t < 1 is needed")
         if not 0.05 <= self.radius_step_px <= 10.0:
@@ -147,7 +149,7 @@ def _edges(image: Image, threshold: float | None) -> tuple[Image, Image]:
     size = np.hypot(gradient[..., 0], gradient[..., 1])
     largest = size.max()
     if largest <= 1e-12 * np.abs(image).max():
-        raise ConstantFrameError("the image is constant: there is no edge in it")
+        raise ConstantFrameError("the image is constant: it has no edge")
     relative = size / largest
     strong = relative > (otsu_threshold(relative) if threshold is None else threshold)
     return np.argwhere(strong).astype(np.float64), gradient[strong] / size[strong][:, None]

@@ -244,7 +244,7 @@ def _first_guess(
         inside = all(-0.5 <= x <= n - 0.5 for x, n in zip(expected, frame.shape, strict=True))
         if not inside:
             raise ObjectAtBorderError(
-                f"start ({expected[0]:.1f}, {expected[1]:.1f}) is outside of the frame"
+                f"start ({expected[0]:.1f}, {expected[1]:.1f}) is outside the frame"
             )
         centre, radius = _search_near(frame, expected, radii)
     return centre[0] - shift[0], centre[1] - shift[1], radius
@@ -291,12 +291,12 @@ def _refuse_doubtful(
 ) -> None:
     if not fit.explained > MINIMUM_EXPLAINED:
         raise NoRoundObjectError(
-            f"what was found at row {begin[0]:.1f}, col {begin[1]:.1f} does not stand out from "
+            f"the object found at row {begin[0]:.1f}, col {begin[1]:.1f} does not stand out from "
             f"the noise (chi2 {fit.explained:.0f}, needs {MINIMUM_EXPLAINED:.0f})"
         )
     moved = float(np.hypot(*(fit.centre_px - begin[:2])))
     if not moved < max(2.0, 0.5 * begin[2]):
-        raise NotConvergedError(f"the fit ran {moved:.1f} px away from its start")
+        raise NotConvergedError(f"the fit moved {moved:.1f} px away from its start")
     refuse_cut_by_border(
         (float(fit.centre_px[0]), float(fit.centre_px[1])),
         fit.radius_px,
@@ -342,7 +342,7 @@ def _checked_consistency(residuals: Array, covariances: Array) -> float:
         row, col = residuals[worst]
         raise InconsistentFramesError(
             f"the frames disagree with their shifts (chi2 {guarded.sum():.0f} for {dof} degrees "
-            f"of freedom), most of all frame {worst}, by row {row:+.3f} col {col:+.3f} px"
+            f"of freedom), worst in frame {worst}, by row {row:+.3f} col {col:+.3f} px"
         )
     return float(exact.sum() / dof)
 
@@ -357,5 +357,5 @@ def _refuse_outside_gate(
     distance = float(np.hypot(centre_px[0] - start[0], centre_px[1] - start[1]))
     if not distance <= gate_px:
         raise OutsideGateError(
-            f"object found {distance:.2f} px from where it was predicted, allowed {gate_px:g} px"
+            f"object found {distance:.2f} px from its predicted position, allowed {gate_px:g} px"
         )

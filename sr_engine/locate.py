@@ -93,7 +93,9 @@ def locate_all(
         except EngineError as error:
             refusals.append(str(error))
     if not found:
-        raise NoRoundObjectError(f"{len(refusals)} round objects seen, none fits: {refusals[0]}")
+        raise NoRoundObjectError(
+            f"{len(refusals)} round objects seen, but none fits: {refusals[0]}"
+        )
     return found
 
 

@@ -227,7 +227,7 @@ def _refuse_expected_outside(expected: Array, shape: tuple[int, ...]) -> None:
     if not all(-0.5 <= x <= n - 0.5 for x, n in zip(expected, shape, strict=True)):
         raise ObjectAtBorderError(
             f"the fiducial is expected at row {expected[0]:.1f}, col {expected[1]:.1f}, outside "
-            f"of the {shape[0]} x {shape[1]} frame"
+            f"the {shape[0]} x {shape[1]} frame"
         )
 
 
@@ -242,7 +242,7 @@ def _refuse_outside(
     distance = math.dist(centre, start)
     if gate_px is not None and not distance <= gate_px:
         raise OutsideGateError(
-            f"circle found {distance:.2f} px from where it was predicted, allowed {gate_px:g} px"
+            f"circle found {distance:.2f} px from its predicted position, allowed {gate_px:g} px"
         )
 
 

@@ -7,6 +7,8 @@ is recorded as failed, with the reason.
 from __future__ import annotations
 
 import contextlib
+import hashlib
+import io
 import math
 import sqlite3
 import time
@@ -150,7 +152,7 @@ def attempt(
     """As `measure`, unless this request has ended the worker again and again."""
     key = f"measurement {request.measurement_id}"
     if attempts.deaths(key) >= MOST_DEATHS:
-        text = f"the worker ended {attempts.deaths(key)} times while it was at this measurement"
+        text = f"the worker crashed {attempts.deaths(key)} times during this measurement"
         _fail(record, request.measurement_id, "worker_ended", text)
         attempts.forget(key)
         return
@@ -172,7 +174,7 @@ def measure(
         found = localize_request(frames, request.method, request.request, psf)
         result = describe_result(frames, found)
         result["point_spread"] = asdict(psf)
-        result["reconstruction"] = _reconstruction(record.case_dir, number, frames, factor)
+        result |= _reconstruction(record.case_dir, number, frames, factor)
         json_text(result)  # NaN, or a value of no known type, is found here and not in the record
     except (EngineError, UnusableSlicesError, UnusableError) as error:
         _fail(record, number, _code_of(error), str(error))
@@ -326,7 +328,7 @@ def localize_request(
     if not miss_px <= gate_px:
         raise OutsideGateError(
             f"the round object found is {miss_px * mean_mm:.1f} mm from where the fiducial is "
-            f"expected; at most {gate_px * mean_mm:.1f} mm are believed"
+            f"expected (limit {gate_px * mean_mm:.1f} mm)"
         )
     return found
 
@@ -407,25 +409,29 @@ def _common_geometry(slices: list[SliceRow]) -> SliceGeometry:
         if not same:
             raise UnusableSlicesError(
                 "geometry_changed",
-                f"slice {row.sop_instance_uid} does not lie where slice "
-                f"{slices[0].sop_instance_uid} of the same measurement lies",
+                f"slice {row.sop_instance_uid} is not at the same position as slice "
+                f"{slices[0].sop_instance_uid} of the same measurement",
             )
     return first
 
 
-def _reconstruction(case_dir: Path, number: int, frames: Frames, factor: int) -> str | None:
-    """Write the super-resolution image as .npy beside the record; None where there is none."""
+def _reconstruction(case_dir: Path, number: int, frames: Frames, factor: int) -> dict[str, Any]:
+    """Write the super-resolution image as .npy beside the record; its name (None where there is no
+    image), and what the file is sworn to be.
+    """
     if len(frames.pixels) < factor**2:
-        return None
+        return {"reconstruction": None}
     try:
         made = reconstruct(frames.pixels, frames.shifts_px, factor=factor, method="fourier")
     except SingularShiftSetError:
-        return None  # slices at one place only: nothing finer to show
+        return {"reconstruction": None}  # slices at one place only: nothing finer to show
     folder = case_dir / IMAGES
     folder.mkdir(exist_ok=True)
     path = folder / f"measurement-{number}.npy"
     temporary = path.with_suffix(".part")
-    with temporary.open("wb") as file:
-        np.save(file, made.image.astype(np.float32))
+    buffer = io.BytesIO()
+    np.save(buffer, made.image.astype(np.float32))
+    temporary.write_bytes(buffer.getvalue())
     temporary.replace(path)
-    return f"{IMAGES}/{path.name}"
+    digest = hashlib.sha256(buffer.getvalue()).hexdigest()
+    return {"reconstruction": f"{IMAGES}/{path.name}", "reconstruction_sha256": digest}

@@ -49,8 +49,8 @@ class Asked:
 def run_in_room(room: Path, out: Path, asked: Asked, *, as_json: bool) -> None:
     """Go on with the study in `out`; ValueError, OSError, StudyEndedError."""
     names = asked.names
-    if not 2 <= asked.punctures <= _MOST_PUNCTURES:
-        raise ValueError(f"--trials is {asked.punctures}; 2 to {_MOST_PUNCTURES} are possible")
+    if not 3 <= asked.punctures <= _MOST_PUNCTURES:
+        raise ValueError(f"--trials is {asked.punctures}; 3 to {_MOST_PUNCTURES} are possible")
     if not 0 < asked.hole_mm[0] < asked.hole_mm[1] or (asked.px_per_mm or 1) <= 0:
         raise ValueError("--hole-mm and --px-per-mm must be positive, the larger radius last")
     try:

@@ -1,5 +1,6 @@
-"""Which tests start processes: `make quick` leaves them out. Its folder is where every test finds
-`real_slices`."""
+"""Which tests start processes: `make quick` leaves them out, and they run first, so that no worker
+waits for the other's last long file. This folder is where every test finds `real_slices`.
+"""
 
 import re
 from functools import cache
@@ -28,3 +29,4 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         fixtures = set(getattr(item, "fixturenames", ()))
         if fixtures & _FIXTURES or _starts_processes(item.path):
             item.add_marker("process")
+    items.sort(key=lambda item: not _starts_processes(item.path))

@@ -93,7 +93,7 @@ def _mended_items(pdu: bytes, mended: Mended) -> Iterator[bytes]:
         else:
             yield _item(kind, value)
     if not contexts:
-        found = "; ".join(mended.remarks) or "it proposes none"
+        found = "; ".join(mended.remarks) or "none were proposed"
         raise MalformedRequestError(f"no presentation context can be used: {found}")
 
 

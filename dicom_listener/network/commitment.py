@@ -123,9 +123,9 @@ class Commitment:
                 return
             if who in self.reports_to and self._on_a_new_one(who, event, report):
                 return
-            text = f"{who} could not be told of transaction {asked.TransactionUID}"
+            text = f"{who} could not be informed of transaction {asked.TransactionUID}"
         except Exception as error:  # whatever the peer does: it is told of it, or we say so
-            text = f"{who} could not be told what is safe: {error}"
+            text = f"{who} could not be informed of what is stored safely: {error}"
         self.on_unreported(text)
 
     def _on_a_new_one(self, who: str, event: int, report: Dataset) -> bool:

@@ -95,11 +95,13 @@ class DropFolder:
             found = dict(self._files())
         except OSError as error:
             if self._is_there:
-                self._alarm("watch_dir_gone", f"{self._folder}: {error.strerror}; C-STORE goes on")
+                self._alarm(
+                    "watch_dir_gone", f"{self._folder}: {error.strerror}; C-STORE still works"
+                )
             self._is_there = False
             return
         if not self._is_there:
-            log.info("watch_dir is there again", folder=str(self._folder))
+            log.info("watch_dir is available again", folder=str(self._folder))
         self._is_there = True
         for name in self._seen.keys() - found.keys():
             del self._seen[name]
@@ -138,7 +140,7 @@ class DropFolder:
             except NotWholeError as error:
                 if still_s < self._unfinished_alarm_s:
                     return
-                text = f"{name}: not whole for {still_s:.0f} s ({error}); it is not used"
+                text = f"{name}: incomplete for {still_s:.0f} s ({error}); it is not used"
                 self._alarm("watch_dir_refused", text)
             except OSError as error:
                 self._alarm("watch_dir_refused", f"{name}: {error.strerror or error}")
@@ -180,9 +182,9 @@ class DropFolder:
 def whole_file(raw: bytes) -> tuple[FileDataset, bytes]:
     """The data set of a DICOM file, and its encoded bytes. Raises NotWholeError."""
     if len(raw) < _PART10_HEAD or raw[128:132] != b"DICM":
-        raise NotWholeError("it does not begin as a DICOM file")
+        raise NotWholeError("it does not start like a DICOM file")
     if raw[132:140] != struct.pack("<HH2sH", 2, 0, b"UL", 4):
-        raise NotWholeError("its meta group does not say how long it is")
+        raise NotWholeError("its meta group does not give its length")
     start = _PART10_HEAD + struct.unpack_from("<L", raw, 140)[0]
     try:
         with warnings.catch_warnings():

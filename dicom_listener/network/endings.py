@@ -35,16 +35,16 @@ def ending_of(association: Any) -> Ending | None:
         return Ending("released", f"{who}: released")
     kind, why = sock.why_ended or _by_state(association)
     if association.requestor.primitive is not None and sock.unfinished_bytes > _BEGUN_BYTES:
-        why += f", in the middle of a message ({sock.unfinished_bytes} bytes of it had come)"
+        why += f", in the middle of a message ({sock.unfinished_bytes} bytes of it had arrived)"
     return Ending(kind, f"{who}: {why}")
 
 
 def _by_state(association: Any) -> tuple[str, str]:
     if association.requestor.primitive is None:
-        return "no_request", "no association request came"
+        return "no_request", "no association request arrived"
     if association.is_aborted or association._sent_abort:
         return "aborted_by_us", "ended by us"
-    return "broken", "the connection is gone"
+    return "broken", "the connection was lost"
 
 
 def _who(association: Any) -> str:

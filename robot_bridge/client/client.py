@@ -24,7 +24,10 @@ from robot_bridge.client.line import Line
 from robot_bridge.client.session import Session
 from robot_bridge.client.stopper import STOP_REPEAT_S, Stopper
 from robot_bridge.protocol import messages
-from robot_bridge.protocol.messages import SETPOINT_MAX_UM, Code, MessageError
+from robot_bridge.protocol.messages import (
+    Code,
+)
+from robot_bridge.protocol.packing import SETPOINT_MAX_UM, MessageError
 from robot_bridge.protocol.phases import WorkPhase
 from robot_bridge.protocol.transport import SerialTransport, Transport
 
@@ -260,7 +263,9 @@ class BridgeClient:
 
     def _refuse_while_stopping(self) -> None:
         if self._stopper.pending:
-            raise RefusedError(Code.STOP_LATCHED, "a STOP is under way; re-arm after it arrived")
+            raise RefusedError(
+                Code.STOP_LATCHED, "a STOP is on its way; re-arm once it has arrived"
+            )
 
 
 def _checked_um(positions_um: Mapping[str, int]) -> dict[str, int]:

@@ -6,7 +6,11 @@ from dataclasses import replace
 from robot_bridge.client.client_values import BridgeStatus, MoveOutcome
 from robot_bridge.client.session import Session
 from robot_bridge.protocol import messages
-from robot_bridge.protocol.messages import Code, CommandState, MessageError
+from robot_bridge.protocol.messages import (
+    Code,
+    CommandState,
+)
+from robot_bridge.protocol.packing import MessageError
 
 OnState = Callable[[CommandState, BridgeStatus], None]
 

@@ -1,7 +1,8 @@
 """What the client tells and raises."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
+from typing import Any
 
 from robot_bridge.protocol import messages
 from robot_bridge.protocol.messages import AxisTravel, CommandState
@@ -75,6 +76,8 @@ class BridgeStatus:
     remembered_um: Mapping[str, int] = field(default_factory=dict)
     correction_um: Mapping[str, int] = field(default_factory=dict)
     motions: int = 0
+    supply_mv: Mapping[str, int] = field(default_factory=dict)
+    board_celsius: Mapping[str, int] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -113,43 +116,18 @@ class LinkCounters:
 
 
 def hello_of(hello: messages.Hello, changed: bool) -> Hello:
-    return Hello(
-        axes=hello.axes,
-        boot_id=hello.boot_id,
-        position_certain=hello.position_certain,
-        last_motion=hello.last_motion,
-        protocol=hello.protocol,
-        schema=hello.schema,
-        software=hello.software,
-        boot_id_changed=changed,
-    )
+    return Hello(**_shared(hello, Hello), boot_id_changed=changed)
 
 
 def status_of(status: messages.Status, age_s: float) -> BridgeStatus:
     state = status.command_state
-    return BridgeStatus(
-        age_s=age_s,
-        phase=WorkPhase(status.phase),
-        armed=status.armed,
-        stopped=status.stopped,
-        stop_reason=status.stop_reason,
-        stop_count=status.stop_count,
-        insertion_locked=status.insertion_locked,
-        moving=status.moving,
-        parked=status.parked,
-        positions_um=status.positions_um,
-        position_certain=status.position_certain,
-        last_motion=status.last_motion,
-        boot_id=status.boot_id,
-        fault=status.fault,
-        command_id=status.command_id,
-        command_state=CommandState(state) if state else None,
-        command_code=status.command_code,
-        command_text=status.command_text,
-        refused=status.refused,
-        certain_axes=status.certain_axes,
-        bound_um=status.bound_um,
-        remembered_um=status.remembered_um,
-        correction_um=status.correction_um,
-        motions=status.motions,
-    )
+    said = _shared(status, BridgeStatus)
+    said["phase"] = WorkPhase(status.phase)
+    said["command_state"] = CommandState(state) if state else None
+    return BridgeStatus(age_s=age_s, **said)
+
+
+def _shared(message: messages.Message, kind: type[Any]) -> dict[str, Any]:
+    """The fields that a message and what the client tells have in common."""
+    names = {column.name for column in fields(message)} & {column.name for column in fields(kind)}
+    return {name: getattr(message, name) for name in names}

@@ -102,7 +102,7 @@ class Session:
             except LinkLostError as error:
                 self._line.drop()
                 if self._clock() >= until_s:
-                    text = f"{self._line.url}: no bridge answers: {error}"
+                    text = f"{self._line.url}: no answer from a bridge: {error}"
                     raise LinkLostError(text) from error
                 self._pause(HELLO_PAUSE_S)
         return self._hello
@@ -122,7 +122,7 @@ class Session:
     def _await_hello(self, until_s: float) -> None:
         while self._hello is None:
             if self._clock() >= until_s:
-                raise LinkLostError("no answer to hello in time")
+                raise LinkLostError("no answer to hello")
             self._receive(min(0.02, max(0.0, until_s - self._clock())))
 
     @property
@@ -267,10 +267,11 @@ class Session:
                 self._answer = event.answer
             case SessionLost():
                 self._lose(
-                    "the bridge does not know this session (it restarted, or another opened)"
+                    "the bridge does not know this session (it has restarted, or another session "
+                    "was opened)"
                 )
             case GaveUp():
-                self._lose(f"no answer after {event.tries} tries")
+                self._lose(f"no answer after {event.tries} attempts")
 
     def _take_status(self, status: messages.Status, now_s: float) -> None:
         # A delayed status is older than one already here.

@@ -201,7 +201,7 @@ class Bridge:
         stalled_s, self._ticked_s = now_s - self._ticked_s, now_s
         if self.armed or self.moving:
             if stalled_s > self.settings.deadman_s:
-                self.stop_for(Code.LOOP_STALLED, f"the bridge stood still for {stalled_s:.1f} s")
+                self.stop_for(Code.LOOP_STALLED, f"the bridge stalled for {stalled_s:.1f} s")
             elif now_s - self._fresh_s > self.settings.deadman_s:
                 text = f"nothing heard from the service for {now_s - self._fresh_s:.2f} s"
                 self.stop_for(Code.LINK_LOST, text)

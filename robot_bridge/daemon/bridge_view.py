@@ -12,7 +12,14 @@ from robot_bridge.daemon.motor_watch import MotorWatch
 from robot_bridge.daemon.permission import Permission
 from robot_bridge.daemon.whereabouts import Stand
 from robot_bridge.protocol.framing import FrameCounters
-from robot_bridge.protocol.messages import PROTOCOL_VERSION, SCHEMA, Code, Hello, Message, Status
+from robot_bridge.protocol.messages import (
+    PROTOCOL_VERSION,
+    Code,
+    Hello,
+    Message,
+    Status,
+)
+from robot_bridge.protocol.packing import SCHEMA
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,6 +99,8 @@ class BridgeView:
                 if axis in self.motion.certain_axes and stand.correction_um
             },
             motions=self.motion.motions,
+            supply_mv={a: round(said["volts_48"] * 1000) for a, said in motors.supply.items()},
+            board_celsius={a: round(said["board_celsius"]) for a, said in motors.supply.items()},
         )
 
     def _stands(self) -> Mapping[str, Stand]:

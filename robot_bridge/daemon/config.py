@@ -128,15 +128,15 @@ class _Table:
         if value is default:
             return value
         if not isinstance(value, str) or not 0 < len(value) <= NAME_MAX:
-            raise self.fail(key, f"{value!r} is not a text of 1 to {NAME_MAX} characters")
+            raise self.fail(key, f"{value!r} is not text of 1 to {NAME_MAX} characters")
         if among and value not in among:
-            raise self.fail(key, f"{value!r} is none of {', '.join(among)}")
+            raise self.fail(key, f"{value!r} is not one of {', '.join(among)}")
         return value
 
     def boolean(self, key: str, default: bool) -> bool:
         value = self.take(key, default)
         if not isinstance(value, bool):
-            raise self.fail(key, f"{value!r} is neither true nor false")
+            raise self.fail(key, f"{value!r} is not true or false")
         return value
 
     def number(self, key: str, lo: float, hi: float, default: Any = ...) -> Any:
@@ -219,9 +219,9 @@ def _axis_from_table(raw: Any, where: str) -> AxisConfig:
         waveform=table.text("waveform", default="delta", among=("rhomb", "delta")),
     )
     if axis.estop_input in (1, 2):
-        raise table.fail("estop_input", "inputs 1 and 2 are the limit switches: 0 or 3")
+        raise table.fail("estop_input", "inputs 1 and 2 are the limit switches: use 0 or 3")
     if axis.home_to == "index" and not closed:
-        raise table.fail("home_to", "an axis without encoder has no index")
+        raise table.fail("home_to", "an axis without an encoder has no index")
     table.finish()
     return axis
 
@@ -230,7 +230,9 @@ def _heartbeat_and_deadman_s(keys: _Table) -> tuple[float, float]:
     heartbeat_s = float(keys.number("heartbeat_s", 0.02, 1.0, default=0.2))
     deadman_s = float(keys.number("deadman_s", 0.1, 5.0, default=1.0))
     if not deadman_s >= 3 * heartbeat_s:
-        raise keys.fail("deadman_s", f"{deadman_s} is below three heartbeats of {heartbeat_s} s")
+        raise keys.fail(
+            "deadman_s", f"{deadman_s} is shorter than three heartbeats of {heartbeat_s} s"
+        )
     return heartbeat_s, deadman_s
 
 
@@ -294,7 +296,7 @@ def _check_axes_differ(axes: tuple[AxisConfig, ...], where: str) -> None:
     places: dict[tuple[str, int], str] = {}
     for axis in axes:
         if axis.name in names:
-            raise ConfigError(f"{where}: bridge.axis: the name {axis.name!r} is there twice")
+            raise ConfigError(f"{where}: bridge.axis: the name {axis.name!r} appears twice")
         names.add(axis.name)
         other = places.setdefault((axis.controller, axis.address), axis.name)
         if other != axis.name:

@@ -107,7 +107,7 @@ def send_stop_orders(orders: Sequence[StopOrder]) -> None:
             try:
                 _send(order)
             except Exception as error:  # whatever it is, the next port must get its stop
-                sys.stderr.write(f"guardian: {order.url}: no stop could be sent: {error}\n")
+                sys.stderr.write(f"guardian: {order.url}: could not send a stop: {error}\n")
 
 
 def _send(order: StopOrder) -> None:

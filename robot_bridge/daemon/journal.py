@@ -101,7 +101,7 @@ class Journal:
         try:
             fcntl.flock(self._fd, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError as error:
-            raise JournalError(f"{self.path}: another bridge is running on it") from error
+            raise JournalError(f"{self.path}: another bridge is using it") from error
 
     def _load(self) -> None:
         data = self.path.read_bytes()
@@ -112,7 +112,7 @@ class Journal:
             except (ValueError, KeyError, TypeError) as error:
                 raise JournalError(
                     f"{self.path}: line {number} is damaged ({error}); "
-                    "keep the file for inspection, and start with a new state_dir"
+                    "keep the file for inspection and start with a new state_dir"
                 ) from error
         if good_end < len(data):
             os.ftruncate(self._fd, good_end)

@@ -284,7 +284,9 @@ def run_bridge(
 ) -> str:
     """The whole life of `python -m robot_bridge`; returns why it ended. Raises StartError."""
     if not config.link:
-        raise StartError("bridge.link is missing: the line to the service (a bench needs --direct)")
+        raise StartError(
+            "bridge.link is missing: it is the line to the service (on a bench, use --direct)"
+        )
     guardian = make_guardian(config) if config.guardian else None
     try:
         daemon = _start(config, make_motors, guardian, exit_with_parent)

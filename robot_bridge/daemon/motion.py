@@ -78,12 +78,12 @@ def progress(motion: Motion, status: MotorStatus, now_s: float, timeout_s: float
         text = f"{status.fault}: {status.fault_text}"
         return Faulty(Ending(CommandState.FAILED, Code.MOTOR_FAULT, text))
     if now_s - motion.accepted_s > timeout_s:
-        text = f"not there after {timeout_s:g} s"
+        text = f"did not arrive within {timeout_s:g} s"
         return Overdue(Ending(CommandState.FAILED, Code.MOTION_TIMEOUT, text))
     if status.moving:
         return Runs()
     if not status.reached:
-        text = f"the motors ended at {_short(status)} without reaching the setpoints"
+        text = f"the motors stopped at {_short(status)} without reaching the setpoints"
         return Over(Ending(CommandState.FAILED, Code.NOT_REACHED, text))
     return Over(Ending(CommandState.DONE, Code.OK, ""))
 
@@ -92,7 +92,7 @@ def _running_out(ending: Ending, status: MotorStatus, waited_s: float) -> Progre
     if not status.moving:
         return Over(ending)
     if waited_s > STANDSTILL_BOUND_S:
-        text = "the motors do not stop"
+        text = "the motors are not stopping"
         return Over(Ending(CommandState.FAILED, Code.MOTOR_FAULT, text))
     return RunsOut()
 

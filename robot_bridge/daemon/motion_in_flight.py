@@ -168,10 +168,8 @@ class MotionInFlight:
         if motion is None:
             return
         match progress(motion, self._motors.status, now_s, self._timeout_s):
-            case Runs():
+            case Runs() | RunsOut():  # a stop that was not confirmed is said again by the bridge
                 return
-            case RunsOut():
-                self._motors.stop_again_if_due()
             case Faulty(ending):
                 self._stop_for(ending.code, ending.text)
                 motion.ending = ending  # the latched stop does not say STOPPED of it
@@ -198,21 +196,21 @@ class MotionInFlight:
 
     def _know_afterwards(self, motion: Motion, ending: Ending) -> None:
         """Where the axes stand now: where they read if they are certain, else somewhere between."""
-        readback_um = self._motors.status.readback_um
+        status = self._motors.status
+        readback_um = status.readback_um
         if motion.homing:
             homed = self._homed_axes(motion.record)
             self.whereabouts.forget(homed)
             if ending.state is CommandState.DONE:
-                self._certain |= homed & self._motors.status.certain_axes
+                self._certain |= homed & status.certain_axes
                 self.whereabouts.homed({axis: readback_um[axis] for axis in homed})
             return
         if not motion.started:
             return
         going = self.whereabouts.going(motion.record.setpoints_um)
         self.whereabouts.arrived(readback_um, self.certain_axes)
-        for axis, stand in going.items():
-            if axis not in self.certain_axes:
-                self.whereabouts.stands[axis] = stand
+        lost = {axis: stand for axis, stand in going.items() if axis not in self.certain_axes}
+        self.whereabouts.ended_early(lost, readback_um, status.within_um)
 
     def _finish(self, ending: Ending) -> None:
         assert self._motion is not None

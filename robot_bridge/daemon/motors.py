@@ -26,11 +26,14 @@ class MotorError(Exception):
 class MotorStatus:
     """What the motors said last.
 
-    moving: a motion begun by `move_to` or `home` has not ended (legs of one motion count as one).
+    moving: a motion begun by `move_to` or `home` has not ended (legs of one motion count as one),
+        or was stopped and nobody has asked yet where its axes stand.
     reached: the last motion ended at its setpoints within the driver's tolerance.
     readback_um: by axis; for an open-loop axis the position that the step count implies.
     certain_axes: an axis is not among them from power-up, controller reset, stall or an unexpected
         motion until its own `home` or `declare_position`; its readback says nothing then.
+    within_um: of an axis whose run was cut short and that is not certain since: how far from its
+        readback that run may have ended.
     fault: a short code while something is wrong (a fault ends the motion), else None.
     boards: the serial number of each axis's controller, "" if it tells none.
     setting_up: controllers are being initialised (again); poll as often as during a motion.
@@ -42,6 +45,7 @@ class MotorStatus:
     readback_um: Mapping[str, int]
     certain_axes: frozenset[str]
     parked: bool = False
+    within_um: Mapping[str, int] = field(default_factory=dict)
     fault: str | None = None
     fault_text: str = ""
     warnings: tuple[str, ...] = ()

@@ -92,7 +92,7 @@ class Requests:
 
     def _set_lock(self, request: SetInsertionLock) -> None:
         if request.locked:
-            text = "the insertion lock was set in motion"
+            text = "the insertion lock was set during motion"
             self.motion.stop(Ending(CommandState.STOPPED, Code.LOCKED_IN_MOTION, text))
         self.journal.lock(request.locked, request.by)
 
@@ -126,7 +126,7 @@ class Requests:
     def _answer_known(self, record: CommandRecord, known: CommandRecord) -> Answer:
         if known.asks_the_same(record):
             return _answer_of(known if known.state.final else self.motion.command or known)
-        text = f"command {record.command_id[:60]!r} was another command before"
+        text = f"command {record.command_id[:60]!r} was already used for another command"
         answer = self.refuse(Code.COMMAND_ID_REUSED, text)
         return replace(answer, state=CommandState.REFUSED.value)
 

@@ -73,8 +73,8 @@ def _stale(standing: Standing, request: Message) -> Refusal | None:
     if is_fresh(standing.now_ms, seen_ms, standing.stale_after_ms):
         return None
     return Code.STALE_COMMAND, (
-        f"sent {standing.now_ms - seen_ms} ms after the sender last heard from the bridge; "
-        f"at most {standing.stale_after_ms} ms are allowed"
+        f"sent {standing.now_ms - seen_ms} ms after the sender last heard from the bridge (limit "
+        f"{standing.stale_after_ms} ms)"
     )
 
 
@@ -88,7 +88,7 @@ def _nobody(standing: Standing, request: Message) -> Refusal | None:
     by = getattr(request, "by")  # noqa: B009
     if len(by.strip()) > 0 and len(by) <= NAME_MAX:
         return None
-    return Code.NO_OPERATOR, f"the request does not say by whom (1 to {NAME_MAX} characters)"
+    return Code.NO_OPERATOR, f"the request names no operator (1 to {NAME_MAX} characters)"
 
 
 def _nameless(standing: Standing, request: Message) -> Refusal | None:
@@ -115,7 +115,8 @@ def _wrong_stop(standing: Standing, request: Message) -> Refusal | None:
     if request.stop_count == standing.stop_count:
         return None
     return Code.WRONG_STOP, (
-        f"the request knows stop {request.stop_count}, the bridge has stop {standing.stop_count}"
+        f"the request refers to stop {request.stop_count}, but the bridge is at stop "
+        f"{standing.stop_count}"
     )
 
 
@@ -138,19 +139,19 @@ def _locked(standing: Standing, request: Message) -> Refusal | None:
 def _in_flight(standing: Standing, request: Message) -> Refusal | None:
     if standing.in_flight is None:
         return None
-    return Code.MOTION_IN_FLIGHT, f"command {standing.in_flight!r} has not ended"
+    return Code.MOTION_IN_FLIGHT, f"command {standing.in_flight!r} is still running"
 
 
 def _phase_forbids_move(standing: Standing, request: Message) -> Refusal | None:
     if ALLOWED[standing.phase].move:
         return None
-    return Code.WRONG_PHASE, f"no motion in phase {standing.phase}"
+    return Code.WRONG_PHASE, f"motion is not allowed in phase {standing.phase}"
 
 
 def _phase_forbids_home(standing: Standing, request: Message) -> Refusal | None:
     if ALLOWED[standing.phase].home:
         return None
-    return Code.WRONG_PHASE, f"no homing in phase {standing.phase}"
+    return Code.WRONG_PHASE, f"homing is not allowed in phase {standing.phase}"
 
 
 def _phase_not_reachable(standing: Standing, request: Message) -> Refusal | None:
@@ -188,9 +189,9 @@ def _bad_bounds(within_um: Mapping[str, int], standing: Standing) -> Refusal | N
 def _bad_correction(standing: Standing, request: Message) -> Refusal | None:
     assert isinstance(request, CorrectPosition)
     if request.correction_um.keys() != request.within_um.keys() or not request.correction_um:
-        return Code.MALFORMED, "every correction needs its own bound, and no other"
+        return Code.MALFORMED, "every correction needs its own bound, and there must be no others"
     if request.based_on_motion != standing.last_motion:
-        return Code.OUTDATED_MEASUREMENT, "the robot has moved since that was seen"
+        return Code.OUTDATED_MEASUREMENT, "the robot has moved since that position was read"
     return _bad_bounds(request.within_um, standing)
 
 
@@ -238,9 +239,9 @@ def _too_little_known(standing: Standing, request: Message) -> Refusal | None:
         low_um, high_um = standing.whereabouts.reach_um(axis.name, setpoint_um)
         if not (axis.min_um <= low_um and high_um <= axis.max_um):
             return Code.BEYOND_TRAVEL, (
-                f"axis {axis.name!r}: sent to {setpoint_um} um it could stand anywhere from "
-                f"{low_um:.0f} to {high_um:.0f} um, its travel is {axis.min_um} to {axis.max_um} "
-                "um: look where it is, home or declare it first"
+                f"axis {axis.name!r}: sent to {setpoint_um} um it could end up anywhere from "
+                f"{low_um:.0f} to {high_um:.0f} um; its travel is {axis.min_um} to "
+                f"{axis.max_um} um. Check where it is, then home or declare it"
             )
     return None
 
@@ -254,7 +255,8 @@ def _outdated(standing: Standing, request: Message) -> Refusal | None:
         )
     if standing.measurement_used:
         return Code.OUTDATED_MEASUREMENT, (
-            f"outdated measurement: the robot has moved on {str(request.measurement_id)[:60]!r}"
+            "outdated measurement: the robot has already moved on "
+            f"{str(request.measurement_id)[:60]!r}"
         )
     return None
 

@@ -21,7 +21,7 @@ def check_setpoints(
             return Code.UNKNOWN_AXIS, f"axis {str(name)[:40]!r} is not one of {', '.join(names)}"
     for axis in axes:
         if axis.name not in setpoints_um:
-            return Code.MISSING_AXIS, f"axis {axis.name!r} has no setpoint; all axes need one"
+            return Code.MISSING_AXIS, f"axis {axis.name!r} has no setpoint; every axis needs one"
         value = setpoints_um[axis.name]
         if type(value) is not int:
             return Code.MALFORMED, f"axis {axis.name!r}: {str(value)[:40]} is not a whole number"

@@ -69,6 +69,11 @@ class Stand:
             there, at_um=(self.at_um + to_um) // 2, known_to_um=there.known_to_um + half_um + 1
         )
 
+    def cut_short(self, at_um: int, within_um: int, growth: Growth) -> "Stand":
+        """A move ended before its time; the way to within `within_um` of `at_um` was counted."""
+        there = self.moved(at_um, growth)
+        return replace(there, known_to_um=there.known_to_um + within_um)
+
     def as_entry(self) -> list[float]:
         return [self.at_um, round(self.known_to_um, 3), round(self.spread_um2, 3),
                 self.correction_um]  # fmt: skip
@@ -123,6 +128,17 @@ class Whereabouts:
             if axis in self.stands:
                 stand = self.stands[axis]
                 self.stands[axis] = stand.moved(readback_um[axis], self.growth_of(axis))
+
+    def ended_early(
+        self, going: Mapping[str, Stand], readback_um: Mapping[str, int],
+        within_um: Mapping[str, int],
+    ) -> None:  # fmt: skip
+        """These axes are not certain after a move; `going`: if nothing more is known of it."""
+        for axis, anywhere in going.items():
+            if axis in within_um:
+                stand, growth = self.stands[axis], self.growth_of(axis)
+                anywhere = stand.cut_short(readback_um[axis], within_um[axis], growth)
+            self.stands[axis] = anywhere
 
     def corrected(self, correction_um: Mapping[str, int], within_um: Mapping[str, int]) -> None:
         for axis, by_um in correction_um.items():

@@ -27,7 +27,7 @@ def set_fault(controller: EmulatedController, name: str, on_off: str) -> None:
     """Raises RequestError."""
     known = [fault.name for fault in fields(AxisFaults)]
     if name not in known or on_off not in ("on", "off"):
-        raise RequestError(f"fault {name} {on_off}: say on or off, of {', '.join(known)}")
+        raise RequestError(f"fault {name} {on_off}: say on or off for one of {', '.join(known)}")
     setattr(controller.faults, name, on_off == "on")
 
 
@@ -39,7 +39,7 @@ def set_line_fault(bus: EmulatedBus, name: str, number: str) -> None:
     try:
         value = float(number) if known[name] is float else int(number)
     except ValueError:
-        raise RequestError(f"line {name}: {number!r} is no such number") from None
+        raise RequestError(f"line {name}: {number!r} is not a valid number") from None
     if not 0 <= value < 1e9:
         raise RequestError(f"line {name}: {number} is not from 0 to 1e9")
     setattr(bus.faults, name, value)
@@ -90,7 +90,7 @@ class Control:
         for controller in self._bus.controllers:
             if str(controller.address) == address:
                 return controller
-        raise RequestError(f"there is no controller {address}")
+        raise RequestError(f"no controller {address}")
 
     def _where(self) -> dict[str, object]:
         controllers = {str(c.address): c for c in self._bus.controllers}

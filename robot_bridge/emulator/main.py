@@ -45,16 +45,16 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="autospine emulator", description=__doc__)
     parser.formatter_class = argparse.RawDescriptionHelpFormatter
     commands = parser.add_subparsers(dest="command", required=True)
-    serve = commands.add_parser("serve", help="emulate controllers until it is ended")
+    serve = commands.add_parser("serve", help="emulate controllers until stopped")
     serve.add_argument("--addresses", default="1,2", help="comma-separated, default 1,2")
     serve.add_argument("--model", choices=("PMD401", "PMD301"), default="PMD401")
     serve.add_argument("--serial-number", type=int, default=4010001, help="of the first board")
-    serve.add_argument("--pty-path", type=Path, help="make a link to the pseudo-terminal here")
+    serve.add_argument("--pty-path", type=Path, help="create a link to the pseudo-terminal here")
     serve.add_argument("--tcp-port", type=int, help="serve on 127.0.0.1 instead (0: any)")
     serve.add_argument("--control-port", type=int, default=0, help="on 127.0.0.1 (0: any)")
     serve.add_argument("--um-per-count", type=float, default=0.1, help="of the encoders")
     serve.add_argument(
-        "--encoder-reversed", action="store_true", help="it counts down as the motor runs forward"
+        "--encoder-reversed", action="store_true", help="it counts down when the motor runs forward"
     )
     serve.add_argument("--index-mm", type=float, help="where the encoders have their index")
     serve.add_argument("--travel-mm", type=float, default=60.0, help="between the hard stops")
@@ -62,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
     serve.add_argument("--speed-factor", type=float, default=1.0)
     tell = commands.add_parser(
         "tell",
-        help="one request to a running emulator",
+        help="send one request to a running emulator",
         description=control.__doc__,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -75,7 +75,7 @@ def _bus_from(args: argparse.Namespace) -> EmulatedBus:
     """Raises ValueError."""
     addresses = [int(a) for a in args.addresses.split(",")]
     if len(set(addresses)) != len(addresses) or not all(0 <= a <= 126 for a in addresses):
-        raise ValueError(f"--addresses {args.addresses}: not different numbers from 0 to 126")
+        raise ValueError(f"--addresses {args.addresses}: must be distinct numbers from 0 to 126")
     for name, value in (("speed-factor", args.speed_factor), ("travel-mm", args.travel_mm)):
         if not 0 < value <= 1000:
             raise ValueError(f"--{name} {value} is outside 0..1000")

@@ -51,8 +51,8 @@ def _client_on_the_line(args: argparse.Namespace, config: BridgeConfig) -> Bridg
     url = args.link or config.service_link
     if url is None:
         raise UsageError(
-            f"{args.config}: bridge.service_link: is missing; name the line with --link, "
-            "or talk to the motors with --direct"
+            f"{args.config}: bridge.service_link: is missing; give the line with --link, or talk "
+            "to the motors with --direct"
         )
     return sessions.client_on_the_line(config, url)
 
@@ -107,7 +107,7 @@ def _positions(status: BridgeStatus) -> dict[str, object]:
             shown[axis] = at_um
         elif axis in status.remembered_um:
             shown[axis] = (
-                f"unknown, taken for {status.remembered_um[axis]} +- {status.bound_um[axis]}"
+                f"unknown, assumed {status.remembered_um[axis]} +- {status.bound_um[axis]}"
             )
         else:
             shown[axis] = "unknown"
@@ -120,7 +120,7 @@ def _positions(status: BridgeStatus) -> dict[str, object]:
 def jog(args: argparse.Namespace, config: BridgeConfig) -> None:
     axis_named(config, args.axis)
     if not 0 < abs(args.mm) <= JOG_MAX_MM:  # NaN fails this too
-        raise UsageError(f"a jog is more than 0 and at most {JOG_MAX_MM} mm, not {args.mm}")
+        raise UsageError(f"a jog must be more than 0 and at most {JOG_MAX_MM} mm, not {args.mm}")
     with connected(args, config) as client:
         setpoints_um = dict(client.status.positions_um)
         setpoints_um[args.axis] += round(args.mm * 1000)
@@ -190,7 +190,7 @@ def stop(args: argparse.Namespace, config: BridgeConfig) -> None:
         show(args, _status_fields(client.status))
     except LinkLostError as error:
         raise CouldNotError(
-            f"STOP was sent {SHOUTS} times, but nobody could be heard acknowledging it ({error})"
+            f"STOP was sent {SHOUTS} times, but no acknowledgement was received ({error})"
         ) from error
     finally:
         client.close()
@@ -275,5 +275,5 @@ def _um_from_text(text: str, mm: str) -> int:
     except ValueError:
         value = math.nan
     if not abs(value) <= 1000.0:
-        raise UsageError(f"{text!r}: say AXIS=MM")
+        raise UsageError(f"{text!r}: use AXIS=MM")
     return round(value * 1000)

@@ -1,4 +1,4 @@
-"""The engineer's commands straight at the controllers: no bridge may be running."""
+"""The engineer's commands directly to the controllers: no bridge may be running."""
 
 import argparse
 import contextlib
@@ -44,13 +44,13 @@ def _latch_emergency(config: BridgeConfig, by: str) -> bool:
         journal = Journal(config.state_dir)
     except JournalError as error:
         raise CouldNotError(
-            f"stopped and parked, but NOT latched ({error}): a running bridge takes its own "
-            "`stop --emergency`, without --direct"
+            f"stopped and parked, but NOT latched ({error}): if a bridge is running, use `stop "
+            "--emergency` without --direct"
         ) from error
     try:
         number = journal.stop.number + 1
         stop = LatchedStop(number, Code.EMERGENCY_STOP.value, True, True)
-        journal.latch_stop(stop, f"by {by}, straight at the controllers", time.time())
+        journal.latch_stop(stop, f"by {by}, directly at the controllers", time.time())
     finally:
         journal.close()
     return True
@@ -60,10 +60,11 @@ def find_encoder(args: argparse.Namespace, config: BridgeConfig) -> None:
     """The controller's script: direction and gain of an encoder, as lines for the room's file."""
     _require_direct(args, "runs the controller's own script")
     axis = axis_named(config, args.axis)
-    confirm(args, f"run {axis.name} by 16 steps (some 0.07 mm) to and fro")
+    confirm(args, f"run {axis.name} by 16 steps (about 0.07 mm) back and forth")
     with sessions.bench(config) as (motors, journal):
         _refuse_if_held(journal)
         _check_room_for(axis, motors.measure_um(axis.name), SCRIPT_STEPS)
+        _forget(journal, axis)
         found = motors.find_encoder(axis.name)
     step_um = (axis.step_um_forward + axis.step_um_reverse) / 2
     show(
@@ -113,8 +114,8 @@ def drives_directly(args: argparse.Namespace, config: BridgeConfig) -> None:
 
 def accept_boards(args: argparse.Namespace, config: BridgeConfig) -> None:
     """Boards were exchanged on purpose: these ones drive the axes from now on."""
-    _require_direct(args, "asks the boards who they are")
-    confirm(args, "take the boards that answer now for the axes' own, and forget the old ones")
+    _require_direct(args, "asks the boards for their identity")
+    confirm(args, "accept the boards that answer now as the axes' own, and forget the old ones")
     with contextlib.closing(Journal(config.state_dir)) as journal:
         motors = make_motors(config)
         try:
@@ -133,6 +134,12 @@ def _refuse_if_held(journal: Journal) -> None:
         raise CouldNotError(f"refused, stop_latched: stop {journal.stop.number}; re-arm first")
 
 
+def _forget(journal: Journal, axis: AxisConfig) -> None:
+    """It is moved by something that no bridge counts."""
+    stands = {name: stand for name, stand in journal.stands.items() if name != axis.name}
+    journal.keep_stands(stands, time.time())
+
+
 def measure_steps(args: argparse.Namespace, config: BridgeConfig) -> None:
     """Run one axis in open loop there and back; print the lines for the room's file."""
     _require_direct(args, "runs the motor in open loop")
@@ -145,6 +152,7 @@ def measure_steps(args: argparse.Namespace, config: BridgeConfig) -> None:
         read_um = None if axis.drive == "closed_loop" else ask_for_um
         if read_um is None:
             _check_room_for(axis, motors.measure_um(axis.name), args.steps)
+        _forget(journal, axis)
         measured = calibrate_steps(motors, axis, steps=args.steps, runs=args.runs, read_um=read_um)
     show(args, measured.as_fields())
 
@@ -160,12 +168,14 @@ def _check_room_for(axis: AxisConfig, here_um: float, steps: int) -> None:
 
 def _require_direct(args: argparse.Namespace, why: str) -> None:
     if not args.direct:
-        raise UsageError(f"{args.command} {why}: it needs --direct, and no bridge running")
+        raise UsageError(f"{args.command} {why}: it needs --direct, with no bridge running")
 
 
 def capture(args: argparse.Namespace, config: BridgeConfig) -> None:
     """Write every byte of the controllers' lines to a file while polling them."""
-    _require_direct(args, "listens at the controllers (a bridge writes to bridge.capture_file)")
+    _require_direct(
+        args, "listens directly to the controllers (a bridge writes to bridge.capture_file)"
+    )
     with sessions.bench(config, capture_file=args.file) as (motors, _journal):
         until_s = time.monotonic() + args.seconds
         while time.monotonic() < until_s:

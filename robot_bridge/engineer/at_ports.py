@@ -25,8 +25,8 @@ def scan_port(args: argparse.Namespace) -> None:
         boards = scan(port)
     if not boards:
         raise CouldNotError(
-            f"no board answers on {args.port}: supply, cable, and 115200 baud? "
-            "(two boards with the same address answer at once: connect them one by one)"
+            f"no board answers on {args.port}: check supply, cable and baud rate (115200). Two "
+            "boards with the same address answer at once: connect them one at a time"
         )
     fields: dict[str, object] = {"boards": [board.as_fields() for board in boards]}
     if hint := _hint(boards):
@@ -37,8 +37,8 @@ def scan_port(args: argparse.Namespace) -> None:
 def _hint(boards: list[Board]) -> str:
     if any(board.address == FACTORY_ADDRESS for board in boards):
         return (
-            "a board answers at 0, the factory's address: before another one joins it on this bus, "
-            "give it its own with `set-address PORT 0 NEW`"
+            "a board answers at 0, the factory address: before adding another to this bus, give "
+            "it its own with `set-address PORT 0 NEW`"
         )
     return ""
 

@@ -127,7 +127,7 @@ def calibrate_steps(
     Raises MotorError (nothing further moves) and CalibrationError.
     """
     if read_um is None and axis.drive != "closed_loop":
-        raise CalibrationError(f"axis {axis.name} has no encoder: give it readings")
+        raise CalibrationError(f"axis {axis.name} has no encoder: supply readings")
     where_um = read_um or (lambda what: motors.measure_um(axis.name))
     readings = []
     for run in range(2 * runs):
@@ -144,7 +144,9 @@ def _run_to_end(motors: PmdMotors, axis: str, steps: int, deadline_s: float) -> 
     while (status := motors.poll()).moving:
         if time.monotonic() > until_s:
             motors.stop()
-            raise MotorError("motion_timeout", f"axis {axis}: longer than {deadline_s:.0f} s")
+            raise MotorError(
+                "motion_timeout", f"axis {axis}: not finished within {deadline_s:.0f} s"
+            )
         time.sleep(0.005)
     if status.fault:
         raise MotorError(status.fault, status.fault_text)

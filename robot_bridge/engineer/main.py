@@ -46,14 +46,14 @@ def _parser() -> argparse.ArgumentParser:
     parser.add_argument("--config", type=Path, help="the room's TOML file (not for a bare port)")
     where = parser.add_mutually_exclusive_group()
     where.add_argument("--link", help="the service's end of the line to a running bridge")
-    where.add_argument("--direct", action="store_true", help="straight at the controllers")
-    parser.add_argument("--by", default=_user(), help="who does this (default: the user)")
+    where.add_argument("--direct", action="store_true", help="talk directly to the controllers")
+    parser.add_argument("--by", default=_user(), help="who is doing this (default: the user)")
     parser.add_argument("--yes", action="store_true", help="move without asking")
     parser.add_argument(
         "--at",
         action="append",
         metavar="AXIS=MM[+-MM]",
-        help="first declare that an axis stands here",
+        help="first declare that an axis is here",
     )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--timeout", type=float, default=8.0, help="seconds to find the bridge")
@@ -62,7 +62,7 @@ def _parser() -> argparse.ArgumentParser:
 
 
 def _add_commands(commands: _Commands) -> None:
-    commands.add_parser("status", help="how the bridge stands").set_defaults(do=show_status)
+    commands.add_parser("status", help="the state of the bridge").set_defaults(do=show_status)
     add = commands.add_parser("jog", help=f"move one axis by at most {JOG_MAX_MM:g} mm")
     add.add_argument("axis")
     add.add_argument("mm", type=float)
@@ -74,7 +74,7 @@ def _add_commands(commands: _Commands) -> None:
     add = commands.add_parser("home", help="find the reference of these axes, or of all")
     add.add_argument("axes", nargs="*", metavar="AXIS")
     add.set_defaults(do=home)
-    add = commands.add_parser("declare", help="say where the robot stands")
+    add = commands.add_parser("declare", help="declare where the robot is")
     add.add_argument("positions", nargs="+", metavar="AXIS=MM[+-MM]")
     add.set_defaults(do=declare)
     add = commands.add_parser("calibrate-steps", help="measure the step length of one axis")
@@ -82,14 +82,14 @@ def _add_commands(commands: _Commands) -> None:
     add.add_argument("--steps", type=int, default=200)
     add.add_argument("--runs", type=int, default=3)
     add.set_defaults(do=measure_steps)
-    add = commands.add_parser("find-encoder", help="the controller finds direction and gain")
+    add = commands.add_parser("find-encoder", help="let the controller find direction and gain")
     add.add_argument("axis")
     add.set_defaults(do=find_encoder)
-    add = commands.add_parser("drives", help="power of the motors, off for imaging")
+    add = commands.add_parser("drives", help="motor power; off for imaging")
     add.add_argument("power", choices=("on", "off"))
     add.set_defaults(do=drives)
     commands.add_parser(
-        "accept-boards", help="boards were exchanged on purpose: these are the axes' own now"
+        "accept-boards", help="boards were exchanged on purpose: accept these as the axes' own"
     ).set_defaults(do=accept_boards)
     add = commands.add_parser("scan", help="which boards answer on a port (needs no file)")
     add.add_argument("port")

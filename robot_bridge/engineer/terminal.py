@@ -35,7 +35,7 @@ def confirm(args: argparse.Namespace, what: str) -> None:
 
 def ask_for_um(what: str) -> float:
     if not sys.stdin.isatty():
-        raise UsageError("an axis without encoder is measured by you: run this on a terminal")
+        raise UsageError("without an encoder you measure the axis yourself: run this on a terminal")
     while True:
         with contextlib.suppress(ValueError):
             return float(input(f"{what}: gauge reading along the axis, mm: ")) * 1000.0

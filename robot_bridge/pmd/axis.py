@@ -8,7 +8,7 @@ An axis that stands where it is asked to be is not commanded at all.
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import replace
 
 from robot_bridge.daemon.config import AxisConfig
 from robot_bridge.pmd import protocol as pmd_protocol
@@ -21,57 +21,22 @@ from robot_bridge.pmd.controller import (
     Steps,
 )
 from robot_bridge.pmd.line import Pause, Procedure
+from robot_bridge.pmd.progress import ProgressWatch, agrees, disagreement
 from robot_bridge.pmd.protocol import (
     MICROSTEPS_PER_STEP,
     Command,
+    PmdError,
     PmdNoValueError,
     PmdRefusedError,
     PmdReplyError,
     PmdTimeoutError,
 )
-from robot_bridge.pmd.setup import MIN_SPEED_HZ, initialise, verify
+from robot_bridge.pmd.runs import SETTLE_S, Pace, Run
+from robot_bridge.pmd.setup import initialise, verify
 from robot_bridge.pmd.status import ERRORS, Status
 
-# The controller's state settles some milliseconds after a command (25 ms in public drivers).
-SETTLE_S = 0.025
-# An encoder that shows no progress: far from the setpoint, where the motor runs fast, it is missed
-# at once; near it the controller may well take its time.
-STALL_WINDOW_S, FAR_WINDOW_S = 0.5, 0.15
-FAR_TOLERANCES, LOOKS_MIN = 10, 4
-STALE_S = 0.12
-RUNAWAY_MARGIN_UM = 100.0
 # Before its first way an encoder has to follow a short run in open loop.
 PROOF_UM = 200.0
-# Of the way that the steps should make: load and frequency change a step by a quarter, and a wrong
-# scale is most often one of two.
-FOLLOWS = 0.6
-
-
-def agrees(moved_um: float, distance_um: float) -> bool:
-    """Whether an encoder's way fits the way that the motor's steps should have made."""
-    return FOLLOWS < moved_um / distance_um < 1 / FOLLOWS
-
-
-def disagreement(moved_um: float, distance_um: float) -> str:
-    return (
-        f"the motor went {distance_um:+.0f} um by its steps and the encoder {moved_um:+.0f} um: "
-        "encoder, its direction, counts_per_mm or the step lengths are wrong"
-    )
-
-
-@dataclass
-class _Run:
-    """An open-loop run under way."""
-
-    from_um: float
-    microsteps: int
-    speed_hz: int
-    begun_s: float
-
-    @property
-    def duration_s(self) -> float:
-        return abs(self.microsteps) / MICROSTEPS_PER_STEP / self.speed_hz
-
 
 _ARRIVED = Status.TARGET_MODE | Status.TARGET_REACHED
 
@@ -85,7 +50,13 @@ class PmdAxis(PmdController):
         response_delay_us: int = POWER_ON_DELAY_US,
     ) -> None:
         super().__init__(config, clock, response_delay_us=response_delay_us)
-        self._run: _Run | None = None
+        self._run: Run | None = None
+        self._cut: Run | None = None  # a run that did not come to its end
+        self._pace = Pace()
+        self._holds_motion = False  # a motion is stored on the board
+        self._begun_s = 0.0  # when what moves it was sent
+        self.unread = False  # it was stopped on its way, and nobody has asked yet where it stands
+        self.within_um: float | None = None  # after a run that was cut short: of its readback
 
     @property
     def speed_hz(self) -> int:
@@ -99,8 +70,44 @@ class PmdAxis(PmdController):
 
     # Moving
 
+    def read_status(self) -> Steps[Status]:
+        asked_s = self.clock()
+        status = yield from super().read_status()
+        run = self._run or self._cut
+        if run is not None:
+            run.saw(bool(status & Status.RUNNING), asked_s, self.clock())
+            self._place_cut()
+        return status
+
+    def _place_cut(self) -> None:
+        """A run that was cut short ended somewhere between two places."""
+        if self._cut is None:
+            return
+        ends_um = [
+            self._cut.from_um + pmd_units.um_from_microsteps(self.config, microsteps)
+            for microsteps in self._pace.microsteps_gone(self._cut)
+        ]
+        self.position_um = sum(ends_um) / 2
+        self.within_um = abs(ends_um[1] - ends_um[0]) / 2
+
+    def locate(self) -> Procedure:
+        """Where an axis stands that was stopped on its way."""
+        try:
+            yield from self.read_position_surely()
+            yield from self.read_status()  # a count that a reset has put to zero is no place
+        except PmdError:
+            self.certain = False
+            self.unread = False
+            raise
+        self.unread = False
+
+    def refresh(self) -> Procedure:
+        yield from self._forget_stored()  # of a motion that was stopped
+        yield from super().refresh()
+        self.unread = False
+
     def stands_at(self, setpoint_um: float) -> bool:
-        return abs(self.position_um - setpoint_um) <= self.config.tolerance_um
+        return self._is_near(self.position_um, setpoint_um)
 
     def set_up(self) -> Procedure:
         """Raises PmdError; afterwards the settings are ours. Nothing moves."""
@@ -166,24 +173,29 @@ class PmdAxis(PmdController):
 
     def _go(self, command: Command) -> Steps[None]:
         """A motion in two steps where the board can do it: what was damaged is never run."""
+        self._begun_s = self.clock()
         if not self.can_store:
             yield command
             return
+        self._holds_motion = True
         yield pmd_protocol.store(command)
+        self._begun_s = self.clock()
         yield pmd_protocol.run_stored(command)
 
     def _forget_stored(self) -> Steps[None]:
-        if self.can_store:
+        if self.can_store and self._holds_motion:
             yield pmd_protocol.overwrite_stored(self.address)
+        self._holds_motion = False
 
     def _closed_leg(self, setpoint_um: int) -> Steps[None]:
         self.at_rest_um = None
+        self.unread = True
         target = pmd_units.count_from_um(self.config, setpoint_um)
         try:
             yield from self._go(pmd_protocol.move_to_count(self.address, target, self.speed_hz))
         except PmdNoValueError:  # no echo: what it does is seen below, and a target is absolute
-            self.doubts["T"] = "a motion is not confirmed by an echo"
-        watch = _ProgressWatch(self, abs(setpoint_um - self.position_um), self.clock())
+            self.doubts["T"] = "the echo does not confirm the motion"
+        watch = ProgressWatch(self.config, abs(setpoint_um - self.position_um), self.clock())
         try:
             yield from self._follow(setpoint_um, watch)
         except GeneratorExit:  # stopped on the way
@@ -193,8 +205,9 @@ class PmdAxis(PmdController):
         yield from self._leave_target_mode()
         yield from self._forget_stored()
         yield from self.read_position_surely()
+        self.unread = False
 
-    def _follow(self, setpoint_um: int, watch: "_ProgressWatch") -> Steps[None]:
+    def _follow(self, setpoint_um: int, watch: ProgressWatch) -> Steps[None]:
         """Until it has arrived. Raises AxisFaultError."""
         told_near = False
         while True:
@@ -218,7 +231,9 @@ class PmdAxis(PmdController):
             if watch.is_away(error_um):  # a count that was reset in between looks the same
                 yield from self.read_status()
                 yield from self.check_status()
-            watch.check(error_um, self.clock())
+            if wrong := watch.what_is_wrong(error_um, self.clock()):
+                self.certain = False
+                raise self.error(*wrong)
 
     def _leave_target_mode(self) -> Steps[None]:
         try:
@@ -246,11 +261,12 @@ class PmdAxis(PmdController):
     def _run_counted(self, go: Command, microsteps: int, *, anywhere: bool = False) -> Steps[None]:
         phase = yield from self._microstep_phase()
         expected = None if phase is None else (phase + microsteps) % MICROSTEPS_PER_STEP
-        run = _Run(self.position_um, microsteps, self.speed_hz, self.clock())
-        self._run = run
+        run = Run(self.position_um, microsteps, self.speed_hz, self.clock())
+        self._run, self._cut = run, None
         self.at_rest_um = None
+        self.unread = self.closed_loop
         try:
-            yield from self._begin_run(go, phase, expected)
+            yield from self._begin_run(run, go, phase, expected)
             yield from self._await_run_end(run)
             ended_at = yield from self._microstep_phase()
             if ended_at != expected and not anywhere:
@@ -259,13 +275,16 @@ class PmdAxis(PmdController):
                 )
             self.position_um = run.from_um + pmd_units.um_from_microsteps(self.config, microsteps)
             self._run = None
+            if not anywhere:
+                self._pace.learn(run)
             yield from self._forget_stored()
         finally:
             if self._run is not None:  # stopped, failed or given up
-                if not self.closed_loop:
-                    self.position_um = self._estimate_um(run)
-                    self.certain = False
                 self._run = None
+                if not self.closed_loop:
+                    self.certain = False
+                    self._cut = run
+                    self._place_cut()
 
     def run_steps(self, steps: int) -> Procedure:
         """A run of whole waveform steps whatever they amount to; the encoder, if any, tells."""
@@ -279,7 +298,9 @@ class PmdAxis(PmdController):
     def measure(self) -> Procedure:
         yield from self.read_position_surely()
 
-    def _begin_run(self, go: Command, phase: int | None, expected: int | None) -> Steps[None]:
+    def _begin_run(
+        self, run: Run, go: Command, phase: int | None, expected: int | None
+    ) -> Steps[None]:
         """Start the run once. If that answer is lost, find out; never start it again.
 
         Even a microstep counter that did not change is no proof that nothing moved (a unit may
@@ -287,7 +308,9 @@ class PmdAxis(PmdController):
         """
         try:
             yield from self._go(go)
+            run.sent_s, run.begun_by_s = self._begun_s, self.clock()
         except PmdTimeoutError:
+            run.sent_s = self._begun_s
             status = yield from self.read_status()
             now_at = yield from self._microstep_phase()
             finished = now_at is not None and now_at == expected != phase
@@ -296,8 +319,8 @@ class PmdAxis(PmdController):
                     "run_unconfirmed", "the answer to a run was lost; position uncertain"
                 ) from None
 
-    def _await_run_end(self, run: _Run) -> Steps[None]:
-        deadline_s = run.begun_s + 1.5 * run.duration_s + 2.0
+    def _await_run_end(self, run: Run) -> Steps[None]:
+        deadline_s = run.sent_s + 1.5 * run.duration_s + 2.0
         yield Pause(SETTLE_S)
         while True:
             status = yield from self.read_status()
@@ -306,12 +329,14 @@ class PmdAxis(PmdController):
             if not status & Status.RUNNING and (yield from self.ask("J")).integer() == 0:
                 return
             if self.clock() > deadline_s:
-                raise self.error("motion_timeout", f"runs longer than {run.duration_s:.1f} s")
+                raise self.error("motion_timeout", f"still running after {run.duration_s:.1f} s")
             yield Pause(POLL_PAUSE_S)
 
     def _microstep_phase(self) -> Steps[int | None]:
         """None if the board does not tell; the end of a run is then known by its status alone."""
-        reply = yield from self.ask_if_it_can("Y0", "a run's length cannot be checked afterwards")
+        reply = yield from self.ask_if_it_can(
+            "Y0", "the length of a run cannot be checked afterwards"
+        )
         if reply is None:
             return None
         values = reply.integers()
@@ -319,8 +344,8 @@ class PmdAxis(PmdController):
             raise PmdReplyError(self.named(f"microstep counter reads {values}"))
         return values[1]
 
-    def _estimate_um(self, run: _Run) -> float:
-        part = min(1.0, (self.clock() - run.begun_s) / max(run.duration_s, 1e-6))
+    def _estimate_um(self, run: Run) -> float:
+        part = min(1.0, (self.clock() - run.sent_s) / max(run.duration_s, 1e-6))
         return run.from_um + part * pmd_units.um_from_microsteps(self.config, run.microsteps)
 
     # Reference
@@ -352,6 +377,7 @@ class PmdAxis(PmdController):
     def _declared(self) -> None:
         self.at_rest_um = self.position_um
         self.certain = True
+        self._cut = self.within_um = None
         self.fault = None
 
     # Stopping
@@ -362,41 +388,18 @@ class PmdAxis(PmdController):
             status = yield from self.read_status()
             if not status & (Status.RUNNING | Status.TARGET_MODE):
                 break
-            yield pmd_protocol.stop(self.address)
+            if "S" in self.doubts:
+                yield from self._hold_here()
+            else:
+                yield pmd_protocol.stop(self.address)
         if not status & (ERRORS | Status.RESET | Status.OVERHEAT) and not self.needs_setup:
             self.fault = None
 
-
-class _ProgressWatch:
-    """Tells a motor that does not come nearer (stalled, encoder lost) or runs away."""
-
-    def __init__(self, axis: PmdAxis, distance_um: float, now_s: float) -> None:
-        self._axis = axis
-        self._best_um = distance_um
-        self._best_s = now_s
-        self._looks = 0
-        self._bound_um = distance_um + RUNAWAY_MARGIN_UM
-        count_um = pmd_units.um_per_count(axis.config)
-        slowest_um_s = MIN_SPEED_HZ * axis.config.step_um_forward
-        self._resolution_s = 3 * count_um / slowest_um_s
-        self._far_um = FAR_TOLERANCES * axis.config.tolerance_um
-
-    def is_stale(self, now_s: float) -> bool:
-        return now_s - self._best_s > STALE_S
-
-    def is_away(self, error_um: float) -> bool:
-        return error_um > self._bound_um
-
-    def check(self, error_um: float, now_s: float) -> None:
-        """Raises AxisFaultError."""
-        self._looks += 1
-        if error_um < self._best_um:
-            self._best_um, self._best_s, self._looks = error_um, now_s, 0
-        if self.is_away(error_um):
-            self._axis.certain = False
-            raise self._axis.error("runaway", f"moves away, {error_um:.0f} um from the setpoint")
-        far = error_um > self._far_um and self._looks >= LOOKS_MIN
-        window_s = (FAR_WINDOW_S if far else STALL_WINDOW_S) + self._resolution_s
-        if now_s - self._best_s > window_s:
-            self._axis.certain = False
-            raise self._axis.error("stalled", f"stands {error_um:.0f} um from the setpoint")
+    def _hold_here(self) -> Steps[None]:
+        """In place of a stop that a board was not seen to understand: its target is where it is."""
+        try:
+            count = (yield from self.ask("E")).integer()
+            target = pmd_protocol.move_to_count(self.address, count, self.speed_hz)
+            yield replace(target, repeatable=False)
+        except PmdError:
+            return  # whether it stands is asked again

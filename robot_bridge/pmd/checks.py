@@ -1,7 +1,5 @@
 """What a motion of a PMD axis must not do, and what is said when one fails; pure."""
 
-from collections.abc import Sequence
-
 from robot_bridge.daemon.config import AxisConfig
 from robot_bridge.daemon.motors import MotorError
 from robot_bridge.pmd.axis import PmdAxis
@@ -36,20 +34,6 @@ def check_known(axis: PmdAxis, setpoint_um: int) -> None:
         raise MotorError(
             "position_uncertain", f"axis {axis.config.name}: home it or declare its position first"
         )
-
-
-def same_addresses(axes: Sequence[AxisConfig]) -> list[str]:
-    """Boards that only their serial numbers tell apart, if their ports' names change places."""
-    said = []
-    for number, axis in enumerate(axes):
-        for other in axes[number + 1 :]:
-            alike = axis.address == other.address and axis.controller != other.controller
-            if alike and None in (axis.serial_number, other.serial_number):
-                said.append(
-                    f"axes {axis.name} and {other.name} have the same address {axis.address} on "
-                    "two ports: give each its serial_number, and name ports by /dev/serial/by-id"
-                )
-    return said
 
 
 def check_run(axis: PmdAxis, steps: int) -> None:

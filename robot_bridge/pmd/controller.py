@@ -84,7 +84,7 @@ class PmdController:
         self.doubts: dict[str, str] = {}  # what the board does not answer, and what follows
         self.park_shift_um: float | None = None
         self.at_rest_um: float | None = None
-        self.expected_parked: bool | None = None
+        self.expected_parked: bool | None = None  # None while that is changed
         self.mark: int | None = None  # what H was set to; None: H cannot be used
         self.can_store = True
         self.estop = False  # the emergency stop's input is low
@@ -94,6 +94,7 @@ class PmdController:
         # One wrong bit makes `T0` (go to zero) of `U0`, but a harmless question of a bare `U`.
         self.status_body = "U"
         self._supply_due_s = 0.0
+        self._asked_in_vain = False  # what an answer told that nobody heard, it does not tell again
 
     @property
     def address(self) -> int:
@@ -146,18 +147,20 @@ class PmdController:
         return reply
 
     def read_status(self) -> Steps[Status]:
+        unheard, self._asked_in_vain = self._asked_in_vain, True
         try:
             reply = yield from self.ask(self.status_body)
-        except PmdSyntaxError:
-            if self.status_body != "U":
+        except (PmdSyntaxError, PmdNoValueError):
+            if self.status_body != "U" or not self.needs_setup:
                 raise
             self.status_body = "U0"  # it does not understand the harmless form
             reply = yield from self.ask(self.status_body)
         self.status = parse_status(reply.value)
         if self.config.estop_input is not None:
             self.estop = not parse_input_bits(reply.value) >> self.config.estop_input & 1
-        if reply.retried and not (yield from self.mark_stands()):
+        if (reply.retried or unheard) and not (yield from self.mark_stands()):
             self.status |= Status.RESET  # the answer that told it was lost
+        self._asked_in_vain = False
         if self.status & Status.RESET:
             self.needs_setup = True
             self.certain = False
@@ -178,10 +181,14 @@ class PmdController:
             raise self.error("setting", f"{MARK} reads {got} after it was set to {mark}")
         self.mark = mark
 
+    def ask_position(self) -> Steps[float]:
+        if not self.closed_loop:
+            return self.position_um
+        count = (yield from self.ask("E")).integer()
+        return pmd_units.um_from_count(self.config, count)
+
     def read_position(self) -> Steps[None]:
-        if self.closed_loop:
-            count = (yield from self.ask("E")).integer()
-            self.position_um = pmd_units.um_from_count(self.config, count)
+        self.position_um = yield from self.ask_position()
 
     def read_position_surely(self) -> Steps[None]:
         """The line has no checksum: two readings that agree, or the third decides."""
@@ -219,39 +226,45 @@ class PmdController:
 
     def refresh(self) -> Procedure:
         """Status and position while nothing of ours moves."""
-        yield from self.read_status()
-        yield from self.read_position()
-        if abs(self._drift_um) > self.config.tolerance_um:
-            yield from self.read_position()  # it may have been the line
-        yield from self.check_status()
+        at_um = yield from self._look()
+        if self.at_rest_um is not None and not self._is_near(at_um, self.at_rest_um):
+            at_um = yield from self._look()  # it may have been the line
+        if self.closed_loop:
+            self.position_um = at_um
         self.check_rest()
         if self.at_rest_um is None:
             self.at_rest_um = self.position_um
         yield from self._read_supply_if_due()
         self.fault = None
 
+    def _look(self) -> Steps[float]:
+        """The position, and then whether the board had lost its supply before it told that."""
+        at_um = yield from self.ask_position()
+        yield from self.read_status()
+        yield from self.check_status()
+        return at_um
+
+    def _is_near(self, at_um: float, other_um: float) -> bool:
+        return abs(at_um - other_um) <= self.config.tolerance_um
+
     def _read_supply_if_due(self) -> Steps[None]:
         if self.clock() < self._supply_due_s:
             return
         self._supply_due_s = self.clock() + SUPPLY_PERIOD_S
-        reply = yield from self.ask_if_it_can("U2", "supply and temperature are not known")
+        reply = yield from self.ask_if_it_can("U2", "supply and temperature are unknown")
         try:
             self.supply = parse_supply(reply.value) if reply else None
         except PmdError:
-            self.doubts["U2"] = "supply and temperature are not understood"
-
-    @property
-    def _drift_um(self) -> float:
-        return 0.0 if self.at_rest_um is None else self.position_um - self.at_rest_um
+            self.doubts["U2"] = "cannot parse supply and temperature"
 
     def check_rest(self) -> None:
         """Raise AxisFaultError if the stage moves, or has moved, without a command."""
         if self.status & (Status.RUNNING | Status.TARGET_MODE):
             self.certain = False
             raise self.error("moving_by_itself", "the controller moves without a command")
-        moved_um = self._drift_um
-        if abs(moved_um) > self.config.tolerance_um:
+        if self.at_rest_um is not None and not self._is_near(self.position_um, self.at_rest_um):
             self.certain = False
+            moved_um = self.position_um - self.at_rest_um
             self.at_rest_um = self.position_um
             raise self.error("moved_by_itself", f"moved {moved_um:+.0f} um without a command")
 
@@ -260,13 +273,13 @@ class PmdController:
     def read_speed_cap(self) -> Steps[None]:
         """What the motor's capacitance allows; the controller measures it while it unparks."""
         self.speed_cap_hz = self.model_max_hz
-        reply = yield from self.ask_if_it_can("U3", "the drive limit of the motor is not known")
+        reply = yield from self.ask_if_it_can("U3", "the motor's drive limit is unknown")
         if reply is None:
             return
         try:
             cap_hz = parse_drive(reply.value).max_frequency_hz
         except PmdError:
-            self.doubts["U3"] = f"the drive limit '{reply.value}' is not understood"
+            self.doubts["U3"] = f"cannot parse drive limit '{reply.value}'"
             return
         if cap_hz > 0:
             self.speed_cap_hz = min(self.model_max_hz, cap_hz)
@@ -274,7 +287,7 @@ class PmdController:
     def unpark(self) -> Steps[None]:
         yield from self.read_status()
         yield from self.check_status()
-        if self.parked:
+        if self.parked or self.expected_parked is None:  # None: a parking may be under way
             yield pmd_protocol.unpark(self.address, self.config.waveform)
             yield from self._await_parked(False)
             yield from self.read_speed_cap()

@@ -49,7 +49,7 @@ def scan(port: Port) -> list[Board]:
     found = [board for address in sorted(addresses) if (board := _board(bus, address))]
     if not found and reader.bad_lines:
         raise MotorError(
-            "protocol", "answers that cannot be read: two boards with the same address, or noise"
+            "protocol", "unreadable answers: two boards with the same address, or noise"
         )
     return found
 
@@ -73,13 +73,16 @@ def _board(line: PmdLine, address: int) -> Board | None:
 def set_address(port: Port, old: int, new: int) -> Board:
     """Give the board at `old` the address `new`, in flash too. Raises MotorError, OSError."""
     if not (0 <= old <= MAX_ADDRESS and 0 <= new <= MAX_ADDRESS) or old == new:
-        raise MotorError("bad_address", f"from address {old} to {new}: two of 0..{MAX_ADDRESS}")
+        raise MotorError(
+            "bad_address",
+            f"from address {old} to {new}: two different addresses of 0..{MAX_ADDRESS} are needed",
+        )
     line = PmdLine(port, ANSWER_S)
     board = _board(line, old)
     if board is None:
         raise MotorError("no_answer", f"no board answers at address {old}")
     if _board(line, new) is not None:
-        raise MotorError("address_taken", f"another board answers at address {new} already")
+        raise MotorError("address_taken", f"another board already answers at address {new}")
     saved: list[str] = []
 
     def give() -> Procedure:
@@ -92,7 +95,7 @@ def set_address(port: Port, old: int, new: int) -> Board:
     except PmdError as error:
         raise MotorError("protocol", f"the board did not take address {new}: {error}") from error
     if not re.match(r"0\b.*Flash OK", saved[0]):
-        raise MotorError("flash", f"address {new} was not kept in flash: '{saved[0]}'")
+        raise MotorError("flash", f"address {new} was not stored in flash: '{saved[0]}'")
     moved = _board(line, new)
     if moved is None or moved.serial_number != board.serial_number:
         raise MotorError("protocol", f"the board does not answer at address {new}")

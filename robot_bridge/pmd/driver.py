@@ -20,7 +20,6 @@ from robot_bridge.pmd.checks import (
     check_set_up,
     check_setpoint,
     code_and_text,
-    same_addresses,
 )
 from robot_bridge.pmd.controller import POWER_ON_DELAY_US
 from robot_bridge.pmd.encoder_script import EncoderFound, find_encoder
@@ -28,11 +27,12 @@ from robot_bridge.pmd.homing import home
 from robot_bridge.pmd.line import PmdLine, Procedure, Task
 from robot_bridge.pmd.ports import OpenPort, PmdPorts, SerialPort
 from robot_bridge.pmd.protocol import PmdEchoError, PmdError, PmdTimeoutError
+from robot_bridge.pmd.report import told_by_axis, warnings_of
 from robot_bridge.pmd.stop import confirm_stops
 
 log = logging.getLogger(__name__)
 
-UNTRIED = "PMD401/PMD301 driver: not tried on hardware; do the first-unit checks of bring_up.md"
+UNTRIED = "PMD401/PMD301 driver: never tested on hardware; do the first-unit checks in bring_up.md"
 POLL_BUDGET_S = 0.02
 INITIALISE_DEADLINE_S = 10.0
 DECLARE_DEADLINE_S = 2.0
@@ -210,7 +210,9 @@ class PmdMotors:
         axes = {name: self._axis(name) for name in positions_um}
         for name, position_um in positions_um.items():
             if not isinstance(position_um, int):
-                raise MotorError("bad_position", f"axis {name}: {position_um!r} um is no integer")
+                raise MotorError(
+                    "bad_position", f"axis {name}: {position_um!r} um is not an integer"
+                )
         self._begin({})
         deadline_s = self._clock() + DECLARE_DEADLINE_S
         for name, axis in axes.items():
@@ -236,7 +238,7 @@ class PmdMotors:
         if self._reconnect_s is not None:
             raise MotorError(*(self._fault or ("port_failed", "a controller port is lost")))
         if self._motion:
-            raise MotorError("moving", "a motion is under way")
+            raise MotorError("moving", "a motion is in progress")
 
     def _axis(self, name: str) -> PmdAxis:
         if name not in self._axes:
@@ -303,7 +305,7 @@ class PmdMotors:
         if failures := self._ports.send_stop():
             self._lose_port("; ".join(failures))
             return
-        self._for_each_axis(lambda axis: axis.confirm_stop(), "stop")
+        self._for_each_axis(_stand_still, "stop")
 
     def _all_reached(self) -> bool:
         return all(
@@ -315,42 +317,13 @@ class PmdMotors:
     def _status(self) -> MotorStatus:
         fault = self._fault or next((a.fault for a in self._axes.values() if a.fault), None)
         return MotorStatus(
-            moving=bool(self._motion),
+            moving=bool(self._motion) or any(axis.unread for axis in self._axes.values()),
             reached=self._reached,
-            readback_um={name: axis.readback_um() for name, axis in self._axes.items()},
-            certain_axes=frozenset(
-                name for name, axis in self._axes.items() if self._initialised and axis.certain
-            ),
-            parked=all(axis.parked for axis in self._axes.values()),
             fault=fault[0] if fault else None,
             fault_text=fault[1] if fault else "",
-            warnings=(UNTRIED, *self._doubts(), *self._park_warnings()),
-            setting_up=any(axis.needs_setup for axis in self._axes.values()),
-            boards={name: axis.board for name, axis in self._axes.items()},
-            supply={
-                name: {
-                    "volts_48": axis.supply.volts_48,
-                    "board_celsius": axis.supply.board_celsius,
-                }
-                for name, axis in self._axes.items()
-                if axis.supply is not None
-            },
+            warnings=(UNTRIED, *warnings_of(self._axes)),
+            **told_by_axis(self._axes, known=self._initialised),
         )
-
-    def _doubts(self) -> list[str]:
-        said = [
-            f"axis {name}: no answer to '{what}': {text}"
-            for name, axis in self._axes.items()
-            for what, text in axis.doubts.items()
-        ]
-        return said + same_addresses([axis.config for axis in self._axes.values()])
-
-    def _park_warnings(self) -> list[str]:
-        return [
-            f"axis {name}: parking moved it by {axis.park_shift_um:+.0f} um"
-            for name, axis in self._axes.items()
-            if axis.park_shift_um is not None and abs(axis.park_shift_um) > axis.config.tolerance_um
-        ]
 
     # A port that goes away and comes back (a plug, a converter)
 
@@ -363,7 +336,7 @@ class PmdMotors:
         self._motion, self._other = {}, {}
         self._fault, self._reached = (code, text), False
         for axis in self._axes.values():
-            axis.certain = False
+            axis.certain = axis.unread = False
             axis.needs_setup = True
         self._reconnect_s = self._clock() + RECONNECT_PAUSE_S
 
@@ -383,7 +356,7 @@ class PmdMotors:
         if failed:
             self._lose_port(failed[1], failed[0])
         elif not self._other:
-            log.warning("the controllers answer again; declare the position, or home")
+            log.warning("the controllers answer again; declare the position or home")
             for axis in self._axes.values():
                 axis.fault = None
             self._fault, self._reconnect_s = None, None
@@ -410,8 +383,17 @@ class PmdMotors:
         )
         if self._reconnect_s is not None:
             self._ports.close()  # initialised again from the start, by `poll`
+        for name, axis in self._axes.items():
+            if axis.unread and axis.config.controller in self._ports.lines:
+                self._other[name] = self._line_of(axis).start(axis.locate(), f"place of {name}")
         if failures:
             raise MotorError("stop_unconfirmed", "; ".join(failures))
+
+
+def _stand_still(axis: PmdAxis) -> Procedure:
+    yield from axis.confirm_stop()
+    if axis.unread:
+        yield from axis.locate()
 
 
 def _look_after(axis: PmdAxis) -> Procedure:

@@ -39,7 +39,7 @@ def find_encoder(axis: PmdAxis) -> Steps[EncoderFound]:
         if state[-1] != 1:
             break
         if axis.clock() > until_s:
-            raise axis.error("script", f"the script runs longer than {SCRIPT_DEADLINE_S:g} s")
+            raise axis.error("script", f"the script is still running after {SCRIPT_DEADLINE_S:g} s")
     if state[-1] != 0:
         raise axis.error("script", f"the encoder did not follow the motor (Y25 reads {state})")
     direction = (yield from axis.ask("Y6")).integer()

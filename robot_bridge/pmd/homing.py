@@ -10,9 +10,10 @@ then.
 from robot_bridge.daemon.config import HOMING_OVERTRAVEL
 from robot_bridge.pmd import protocol as pmd_protocol
 from robot_bridge.pmd import units as pmd_units
-from robot_bridge.pmd.axis import FOLLOWS, PmdAxis, agrees, disagreement
+from robot_bridge.pmd.axis import PmdAxis
 from robot_bridge.pmd.controller import AxisFaultError, Steps
 from robot_bridge.pmd.line import Procedure
+from robot_bridge.pmd.progress import FOLLOWS, agrees, disagreement
 from robot_bridge.pmd.protocol import Command
 from robot_bridge.pmd.status import Inputs
 
@@ -39,7 +40,7 @@ def home(axis: PmdAxis, home_um: int) -> Procedure:
     else:
         raise _cannot(
             axis,
-            "it has neither an encoder nor a limit switch to tell that it is there; declare it",
+            "it has no encoder or limit switch to detect a reference; declare its position",
         )
 
 
@@ -74,21 +75,21 @@ def _home_to_switch(axis: PmdAxis, home_um: int) -> Steps[None]:
         on = name if _is_on(before, name) else other
         raise _cannot(
             axis,
-            f"the {on} limit switch is on before the run: stuck, wired the other way round, or the "
-            "axis stands on it (jog off it first)",
+            f"the {on} limit switch is on before the run: it is stuck or wired the wrong way "
+            "round, or the axis is on it (jog off it first)",
         )
     if not (yield from _run_to_switch(axis, outwards * _search_um(axis))):
         raise _cannot(axis, f"no limit switch after {_search_um(axis) / 1000:.1f} mm")
     there = yield from axis.read_inputs()
     if not _is_on(there, name) or _is_on(there, other):
         wrong = other if _is_on(there, other) else "no"
-        raise _cannot(axis, f"the run {name} was stopped, and {wrong} limit switch is on now")
+        raise _cannot(axis, f"the run {name} was stopped, and {wrong} limit switch is now on")
     yield from axis.read_position()
     at_um = axis.position_um
     yield from _leave(axis, -outwards * min(BACK_OFF_UM, _search_um(axis) / 4), name)
     yield from _expect_encoder(axis, at_um, -outwards * min(BACK_OFF_UM, _search_um(axis) / 4))
     if not (yield from _run_to_switch(axis, outwards * 2 * BACK_OFF_UM)):
-        raise _cannot(axis, f"the {name} limit switch did not come back")
+        raise _cannot(axis, f"the {name} limit switch did not trip again")
     yield pmd_protocol.stop(axis.address)
     yield from axis.declare(home_um)
     # Off the switch again, or the next homing could not tell it from one that is stuck.
@@ -117,7 +118,7 @@ def _leave(axis: PmdAxis, distance_um: float, name: str) -> Steps[None]:
     if (yield from _run_to_switch(axis, distance_um)) or _is_on(
         (yield from axis.read_inputs()), name
     ):
-        raise _cannot(axis, f"the {name} limit switch does not go off when the axis leaves it")
+        raise _cannot(axis, f"the {name} limit switch stays on when the axis leaves it")
 
 
 def _expect_encoder(axis: PmdAxis, from_um: float, distance_um: float) -> Steps[None]:
@@ -146,7 +147,7 @@ def _home_to_end(axis: PmdAxis, home_um: int) -> Steps[None]:
     if abs(axis.position_um - at_um) > max(axis.config.tolerance_um, axis.jitter_um):
         raise _cannot(
             axis,
-            f"the end was {axis.position_um - at_um:+.0f} um elsewhere the second time",
+            f"the end was {axis.position_um - at_um:+.0f} um away the second time",
         )
     yield pmd_protocol.stop(axis.address)
     yield from axis.declare(home_um)

@@ -45,7 +45,7 @@ class SerialPort:
         while left:
             _, ready, _ = select.select([], [self._port.fileno()], [], WRITE_WAIT_S)
             if not ready:
-                raise OSError(f"takes no more bytes, {len(left)} of {len(data)} are left")
+                raise OSError(f"accepts no more bytes; {len(left)} of {len(data)} are left")
             left = left[self._port.write(left) :]
         return len(data)
 

@@ -114,7 +114,7 @@ def run_microsteps(address: int, microsteps: int, speed_hz: int) -> Command:
     whole motion; a negative zero would lose it, so a zero part stays unsigned.
     """
     if not isinstance(microsteps, int) or microsteps == 0:
-        raise PmdCommandError(f"an open-loop run of {microsteps!r} microsteps is no motion")
+        raise PmdCommandError(f"an open-loop run of {microsteps!r} microsteps is not a motion")
     steps, rest = divmod(abs(microsteps), MICROSTEPS_PER_STEP)
     _checked_i32(steps, "steps")
     sign = -1 if microsteps < 0 else 1

@@ -65,7 +65,7 @@ def verify(c: PmdController) -> Steps[None]:
     for number, value in differing.items():
         c.needs_setup = True
         c.certain = False
-        raise c.error("setting", f"Y{number} reads {value}, not {c.settings[number]} as it was set")
+        raise c.error("setting", f"Y{number} reads {value}, not {c.settings[number]} as set")
 
 
 def _differing(c: PmdController) -> Steps[dict[int, int]]:
@@ -86,7 +86,7 @@ def _identify(c: PmdController) -> Steps[None]:
         raise c.error(
             "wrong_board",
             f"board {board or 'without a serial number'} answers on {c.config.controller} where "
-            f"board {known} belongs: two boards have changed places, or one was replaced",
+            f"board {known} belongs: two boards were swapped, or one was replaced",
         )
     c.board = board
 
@@ -95,12 +95,12 @@ def _serial_number(c: PmdController) -> Steps[str]:
     """Read until two answers agree: the line has no checksum, and this one is kept for long."""
     last = None
     for _ in range(SERIAL_TRIES):
-        reply = yield from c.ask_if_it_can("Y42", "boards that change places are not told apart")
+        reply = yield from c.ask_if_it_can("Y42", "swapped boards would not be noticed")
         board = str(reply.integer()) if reply else ""
         if board == last:
             return board
         last = board
-    raise c.error("protocol", f"tells another serial number each time, last '{last}'")
+    raise c.error("protocol", f"reports a different serial number each time, last '{last}'")
 
 
 def _stop(c: PmdController) -> Steps[None]:
@@ -108,11 +108,11 @@ def _stop(c: PmdController) -> Steps[None]:
     try:
         yield pmd_protocol.stop(c.address)
     except PmdNoValueError:
-        c.doubts["S"] = "a stop is not confirmed by an echo"
+        c.doubts["S"] = "the echo does not confirm a stop"
 
 
 def _read_mark(c: PmdController) -> Steps[int | None]:
-    reply = yield from c.ask_if_it_can(MARK, "a loss of supply is told by its status alone")
+    reply = yield from c.ask_if_it_can(MARK, "a supply failure shows only in its status")
     return reply.integer() if reply else None
 
 
@@ -130,7 +130,7 @@ def _probe_storing(c: PmdController) -> Steps[None]:
     except PmdError:
         pass
     if not c.can_store:
-        c.doubts["B"] = "commands cannot be stored: a damaged motion is noticed only as it begins"
+        c.doubts["B"] = "commands cannot be stored: a damaged motion is noticed only once it starts"
 
 
 def _wanted(c: PmdController) -> dict[int, int]:
@@ -182,7 +182,8 @@ def _count(c: PmdController) -> Steps[int | None]:
 
 def _set_response_delay(c: PmdController) -> Steps[None]:
     reply = yield from c.ask_if_it_can(
-        f"Y{RESPONSE_DELAY}", f"the response delay is the controller's own ({POWER_ON_DELAY_US} us)"
+        f"Y{RESPONSE_DELAY}",
+        f"the response delay is the controller's default ({POWER_ON_DELAY_US} us)",
     )
     if reply and reply.integer() != c.response_delay_us:
         yield from _set_one(c, RESPONSE_DELAY, c.response_delay_us)
@@ -196,7 +197,7 @@ def _set(c: PmdController, wanted: dict[int, int]) -> Steps[None]:
     c.settings = {}
     have = yield from _read_some(c, wanted)
     if unread := [f"Y{number}" for number in wanted if number not in have]:
-        c.doubts[", ".join(unread)] = "nothing tells that these settings hold"
+        c.doubts[", ".join(unread)] = "these settings cannot be read back"
     for number, value in wanted.items():
         if have.get(number) == value:
             continue

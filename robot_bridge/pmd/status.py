@@ -120,7 +120,7 @@ def parse_supply(text: str) -> Supply:
             "*" in text,
         )
     except (IndexError, ValueError):
-        raise PmdReplyError(f"supply readings '{text}' are not understood") from None
+        raise PmdReplyError(f"cannot parse supply readings '{text}'") from None
 
 
 @dataclass(frozen=True)
@@ -143,4 +143,4 @@ def parse_drive(text: str) -> Drive:
             waveform.strip(),
         )
     except ValueError:
-        raise PmdReplyError(f"drive limits '{text}' are not understood") from None
+        raise PmdReplyError(f"cannot parse drive limits '{text}'") from None

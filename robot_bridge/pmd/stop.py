@@ -19,7 +19,6 @@ def confirm_stops(
 ) -> list[str]:
     """Ask all axes on open lines, at most STOP_DEADLINE_S long. Returns what failed.
 
-    Where they stand now is asked as well, as far as the time goes.
     `timeout_s`: of one answer, otherwise; here it is shorter.
     """
     deadline_s = clock() + STOP_DEADLINE_S
@@ -63,4 +62,3 @@ def _stop_stubbornly(axis: PmdAxis, confirmed: set[str]) -> Procedure:
         except PmdError:
             continue
         confirmed.add(axis.config.name)
-    yield from axis.read_position()

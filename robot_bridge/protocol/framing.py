@@ -19,8 +19,8 @@ from robot_bridge.protocol.messages import (
     BOOTSTRAP_KINDS,
     FROM_BRIDGE,
     PROTOCOL_VERSION,
-    SCHEMA_HASH,
 )
+from robot_bridge.protocol.packing import SCHEMA_HASH
 
 FRAME_MAX = 2048  # encoded bytes between two delimiters; longer is noise
 _HEADER = struct.Struct(">BBII")

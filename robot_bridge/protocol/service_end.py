@@ -10,19 +10,16 @@ from robot_bridge.protocol import framing
 from robot_bridge.protocol.framing import Deframer, Frame, FrameCounters, StopAckFrame, StopFrame
 from robot_bridge.protocol.messages import (
     PROTOCOL_VERSION,
-    SCHEMA,
     Answer,
     Code,
     Heartbeat,
     Hello,
     HelloRequest,
     Message,
-    MessageError,
     NoSession,
     Status,
-    pack,
-    unpack,
 )
+from robot_bridge.protocol.packing import SCHEMA, MessageError, pack, unpack
 
 
 @dataclass(frozen=True)

@@ -62,7 +62,7 @@ class SerialTransport:
                 return b""
             return bytes(self._serial.read(READ_MAX))
         except (serial.SerialException, OSError, ValueError, TypeError) as error:
-            raise TransportError(f"{self.url}: is gone: {_reason(error)}") from error
+            raise TransportError(f"{self.url}: disconnected: {_reason(error)}") from error
 
     def write(self, data: bytes) -> None:
         if not data:
@@ -93,16 +93,16 @@ class DescriptorTransport:
             ready, _, _ = select.select([self._end], [], [], max(0.0, wait_s))
             data = self._end.recv(READ_MAX) if ready else None
         except (OSError, ValueError) as error:
-            raise TransportError(f"the other end is gone: {_reason(error)}") from error
+            raise TransportError(f"the other end has disconnected: {_reason(error)}") from error
         if data == b"":
-            raise TransportError("the other end is gone")
+            raise TransportError("the other end has disconnected")
         return data or b""
 
     def write(self, data: bytes) -> None:
         try:
             self._end.sendall(data)
         except OSError as error:
-            raise TransportError(f"the other end is gone: {_reason(error)}") from error
+            raise TransportError(f"the other end has disconnected: {_reason(error)}") from error
 
     def close(self) -> None:
         self._end.close()

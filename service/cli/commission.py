@@ -36,12 +36,16 @@ class BrokenOffError(Exception):
 @app.command()
 def commission(
     config: Annotated[Path, typer.Option("--config", help="The room's TOML file.")],
-    out: Annotated[Path, typer.Option(help="Folder of the evidence; the same one to go on.")],
-    who: Annotated[str, typer.Option(help="Who measures, and signs for it.")],
-    series: Annotated[int, typer.Option(min=1, help="Series with the usual readout.")] = 5,
-    slices: Annotated[int, typer.Option(min=1, help="Slices of one series.")] = 4,
+    out: Annotated[
+        Path, typer.Option(help="Folder for the evidence; name the same one to continue.")
+    ],
+    who: Annotated[str, typer.Option(help="Who measures and signs.")],
+    series: Annotated[
+        int, typer.Option(min=1, help="Number of series with the usual readout.")
+    ] = 5,
+    slices: Annotated[int, typer.Option(min=1, help="Slices per series.")] = 4,
     reversed_readout: Annotated[
-        bool, typer.Option(help="One more series with the readout's sign changed.")
+        bool, typer.Option(help="One more series with the readout direction reversed.")
     ] = True,
     patience_s: Annotated[
         float, typer.Option(min=1, help="How long to wait for the slices of a series.")
@@ -59,23 +63,23 @@ def commission(
     room = load_config(config)
     with Session(room, out) as session:
         print(f"Slices are received on port {session.port} as {room.listener.ae_title}.")
-        print("A phantom with the fiducial lies still on the table; nothing moves meanwhile.")
+        print("Put a phantom with the fiducial on the table and leave it still; nothing may move.")
         for step in session.steps(series, reversed_too=reversed_readout):
             while not _scan(session, step, slices, patience_s):
-                print("The same series once more.")
+                print("The same series again.")
         raise SystemExit(_judge(session, room.room.name, who, out, room.imaging))
 
 
 def _scan(session: Session, step: Step, slices: int, patience_s: float) -> bool:
     """One series; False where it has to be made again."""
-    how = ", THE SIGN OF THE READOUT CHANGED" if step.reversed_readout else ""
+    how = ", READOUT DIRECTION REVERSED" if step.reversed_readout else ""
     print(f"Series {step.number}: {slices} coronal slices with the guide's protocol{how}.")
-    started = _pressed("start", "Press Enter in the moment it STARTS.")
-    ended = _pressed("end", "Press Enter in the moment it ENDS.")
+    started = _pressed("start", "Press Enter the moment it STARTS.")
+    ended = _pressed("end", "Press Enter the moment it ENDS.")
     deadline_s = time.monotonic() + patience_s
     while len(came := session.came_since(started)) < slices and time.monotonic() < deadline_s:
         time.sleep(_LOOK_S)
-    print(f"{len(came)} of {slices} slices came.", flush=True)
+    print(f"{len(came)} of {slices} slices arrived.", flush=True)
     try:
         session.keep(step, started, ended)
     except CommissioningError as error:
@@ -87,7 +91,7 @@ def _scan(session: Session, step: Step, slices: int, patience_s: float) -> bool:
 def _pressed(kind: str, words: str) -> Press:
     print(words, flush=True)
     if not sys.stdin.readline():
-        raise BrokenOffError("broken off; call it again with the same --out to go on")
+        raise BrokenOffError("interrupted; run it again with the same --out to continue")
     return Press("start" if kind == "start" else "end", time.time())
 
 

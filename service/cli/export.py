@@ -28,6 +28,7 @@ from service.room.images import (
     reconstruction_pixels,
     slice_pixels,
 )
+from service.room.integrity import check_slice_file
 
 app = typer.Typer(add_completion=False)
 FORMAT = "autospine-case-export"
@@ -48,15 +49,15 @@ def export(
     out: Annotated[
         Path | None, typer.Option(help="The zip to write; by default CASE.zip here.")
     ] = None,
-    force: Annotated[bool, typer.Option(help="Replace a file that is there.")] = False,
+    force: Annotated[bool, typer.Option(help="Overwrite an existing file.")] = False,
     slicer: Annotated[
-        bool, typer.Option("--slicer", help="Write a scene for 3D Slicer (CASE.mrb) instead.")
+        bool, typer.Option("--slicer", help="Write a 3D Slicer scene (CASE.mrb) instead.")
     ] = False,
 ) -> None:
     """Write a case as one zip: DICOM, JSON lines, images. Or as a scene for 3D Slicer."""
     target = out or Path(f"{case.resolve().name}.{'mrb' if slicer else 'zip'}")
     if target.exists() and not force:
-        raise ExportError(f"{target} is there already (--force replaces it)")
+        raise ExportError(f"{target} already exists (--force overwrites it)")
     with CaseRecord(case, read_only=True) as record:
         members = (_write_scene if slicer else write_export)(record, target)
     print(f"{target}: {members} files")
@@ -67,7 +68,7 @@ def _write_scene(record: CaseRecord, target: Path) -> int:
     from service.cli.slicer_scene import write_scene
 
     if record.case() is None:
-        raise ExportError(f"{record.case_dir}: no case was begun here")
+        raise ExportError(f"{record.case_dir}: no case here")
     fresh = target.with_name(target.name + ".part")
     try:
         members = write_scene(record, fresh, target.stem)
@@ -82,7 +83,7 @@ def _write_scene(record: CaseRecord, target: Path) -> int:
 def write_export(record: CaseRecord, target: Path) -> int:
     """Write the zip atomically; return the number of its members. The case is not changed."""
     if record.case() is None:
-        raise ExportError(f"{record.case_dir}: no case was begun here")
+        raise ExportError(f"{record.case_dir}: no case here")
     whole = record.verify()
     fresh = target.with_name(target.name + ".part")
     digests: dict[str, str] = {}
@@ -140,8 +141,10 @@ def _members(record: CaseRecord, missing: list[str]) -> Iterator[tuple[str, byte
         if not path.is_file():
             missing.append(row.path)
             continue
+        check_slice_file(record, row)
         yield f"dicom/{Path(row.path).name}", path.read_bytes()
     for path in sorted((record.case_dir / OUTPUTS).glob("*.dcm")):
+        record.is_sealed(f"{OUTPUTS}/{path.name}")
         yield f"outputs/{path.name}", path.read_bytes()
     yield from _images(record)
 

@@ -51,7 +51,7 @@ def read_shift_table(path: Path) -> dict[str, tuple[float, float]]:
             raise BadFileError(f"{path}: line {number}: column {missing[0]} is missing")
         name = Path(row["file"]).name
         if name in shifts:
-            raise BadFileError(f"{path}: line {number}: {name} is there twice")
+            raise BadFileError(f"{path}: line {number}: {name} appears twice")
         shifts[name] = (_number(row, "row_px", path, number), _number(row, "col_px", path, number))
     if not shifts:
         raise BadFileError(f"{path}: has no rows")

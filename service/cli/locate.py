@@ -38,28 +38,29 @@ app = typer.Typer(add_completion=False)
 def locate(
     path: Annotated[list[Path], typer.Argument(help="DICOM files or folders.")],
     shifts: Annotated[
-        Path | None, typer.Option(help="CSV file,row_px,col_px: one object, all files together.")
+        Path | None,
+        typer.Option(help="CSV file,row_px,col_px: localize one object from all files together."),
     ] = None,
     template: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file,row_px,col_px: learn the object's image from these files, beside the "
-            "table, and fit it in every file of PATH."
+            help="CSV file,row_px,col_px: learn the object's image from the files listed (beside "
+            "the CSV), and fit it in every file of PATH."
         ),
     ] = None,
     method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "ml",
     radius_mm: Annotated[str, typer.Option(help="Smallest and largest radius: LO,HI.")] = "2,20",
-    roi: Annotated[str, typer.Option(help="Pixels R0,C0,R1,C1 to look in.")] = "",
+    roi: Annotated[str, typer.Option(help="Region to search, in pixels: R0,C0,R1,C1.")] = "",
     json_: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
-    png: Annotated[Path | None, typer.Option(help="Draw what was found here.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Write a PNG of what was found.")] = None,
 ) -> int:
     """Find the round objects in DICOM files."""
     if method not in METHODS:
-        raise BadFileError(f"--method {method}: known are {', '.join(METHODS)}")
+        raise BadFileError(f"--method {method}: use one of {', '.join(METHODS)}")
     radii_mm = _numbers(radius_mm, 2, "--radius-mm")
     region = tuple(round(x) for x in _numbers(roi, 4, "--roi")) if roi else None
     if template is not None and (shifts is not None or method != "ml"):
-        raise BadFileError("--template goes with neither --shifts nor --method")
+        raise BadFileError("--template cannot be combined with --shifts or --method")
     if template is not None:
         found, shown, problems = _locate_by_template(path, template, radii_mm, region)
     elif shifts is not None:
@@ -241,7 +242,7 @@ def _refuse_size(one: Localization | Located, radii_px: tuple[float, float]) -> 
         row, col = one.centre_px
         raise NoRoundObjectError(
             f"the round object at row {row:.1f}, col {col:.1f} has a radius of about "
-            f"{one.radius_px:.2f} px; {radii_px[0]:.2f} to {radii_px[1]:.2f} px are looked for"
+            f"{one.radius_px:.2f} px; {radii_px[0]:.2f} to {radii_px[1]:.2f} px is allowed"
         )
 
 
@@ -315,7 +316,9 @@ def _numbers(text: str, count: int, name: str) -> list[float]:
         values = []
     growing = count != 2 or values == sorted(values)
     if len(values) != count or not all(np.isfinite(values)) or not growing:
-        raise BadFileError(f"{name} {text!r}: wanted {count} numbers, growing, with commas between")
+        raise BadFileError(
+            f"{name} {text!r}: expected {count} increasing numbers, separated by commas"
+        )
     return values
 
 

@@ -67,7 +67,7 @@ def _learnt(table: Path, radii_mm: Sequence[float]) -> tuple[Template, Slice]:
     for name in shifts:
         file = table.parent / name
         if not file.is_file():
-            raise BadFileError(f"{table}: {name} is not beside it")
+            raise BadFileError(f"{table}: {name} is not in the same folder")
         try:
             frames.append(read_frames(file)[0])
         except UnusableError as error:
@@ -93,13 +93,14 @@ def _refuse_unlike(header: Slice, like: Slice, name: str) -> None:
     """Another spacing or orientation shows the object otherwise: that takes another template."""
     here, there = geometry_of(header, Path(name)), geometry_of(like, Path(name))
     if not np.allclose(here.spacing_mm, there.spacing_mm, rtol=1e-3):
-        raise BadFileError(f"{name}: pixels of {here.spacing_mm} mm, the template's have "
-                           f"{there.spacing_mm} mm")  # fmt: skip
+        raise BadFileError(
+            f"{name}: pixels of {here.spacing_mm} mm, the template's are {there.spacing_mm} mm"
+        )
     same = np.allclose(here.row_direction, there.row_direction, atol=1e-3) and np.allclose(
         here.col_direction, there.col_direction, atol=1e-3
     )
     if not same:
-        raise BadFileError(f"{name}: the slice is oriented otherwise than the template's")
+        raise BadFileError(f"{name}: the slice's orientation differs from the template's")
 
 
 def _located(

@@ -24,7 +24,7 @@ from service.cli.room_checks import LOOPBACK, open_to_others
 
 ConfigOption = Annotated[Path, typer.Option("--config", help="The room's TOML file.")]
 ParentOption = Annotated[
-    bool, typer.Option("--exit-with-parent", help="End when standard input is closed.")
+    bool, typer.Option("--exit-with-parent", help="Exit when standard input is closed.")
 ]
 FAILED = 3
 _LET_GO_S = 3.0
@@ -32,7 +32,7 @@ _SWITCH_INTERVAL_S = 0.0002
 
 
 def service(config: ConfigOption, exit_with_parent: ParentOption = False) -> None:
-    """Page, API, procedure, planner."""
+    """Page, API, procedures and planning."""
     configure_logs()
     room = load_config(config)
     cases = Cases(*room.room.folders)
@@ -131,7 +131,7 @@ def bind(room: Config) -> socket.socket:
     listening = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET)
     listening.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     if host not in LOOPBACK and room.service.tls_certificate is None:
-        structlog.get_logger().warning("tokens travel unencrypted: set service.tls_certificate")
+        structlog.get_logger().warning("tokens are sent unencrypted: set service.tls_certificate")
     try:
         listening.bind((host, port))
         # now, not when uvicorn comes to it: who reads the ready line may connect at once
@@ -145,4 +145,4 @@ def bind(room: Config) -> socket.socket:
 def check_device(link: str) -> None:
     """ConfigError if the line to the bridge is a device that does not exist."""
     if "://" not in link and not Path(link).exists():
-        raise ConfigError(f"key service.bridge_link: there is no device {link}")
+        raise ConfigError(f"key service.bridge_link: no device {link}")

@@ -27,11 +27,11 @@ def reconstruct_files(
     out: Annotated[Path, typer.Option(help="The derived DICOM image to write.")],
     factor: Annotated[int, typer.Option(min=2, max=4, help="How many times finer.")] = 2,
     method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "fourier",
-    png: Annotated[Path | None, typer.Option(help="Write a PNG, too.")] = None,
+    png: Annotated[Path | None, typer.Option(help="Also write a PNG.")] = None,
 ) -> int:
     """Super-resolution image from DICOM files."""
     if method not in METHODS:
-        raise BadFileError(f"--method {method}: known are {', '.join(METHODS)}")
+        raise BadFileError(f"--method {method}: use one of {', '.join(METHODS)}")
     table = read_shift_table(shifts)
     files = files_of(path)
     frames = [_frame(file) for file in files]

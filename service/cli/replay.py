@@ -80,13 +80,13 @@ class ReplayedMeasurement:
 def replay(
     case: Annotated[Path, typer.Argument(help="The case's folder.")],
     method: Annotated[
-        str | None, typer.Option(help=f"Measure by this instead: {', '.join(METHODS)}.")
+        str | None, typer.Option(help=f"Measure with this method instead: {', '.join(METHODS)}.")
     ] = None,
     as_json: Annotated[bool, typer.Option("--json", help="JSON instead of tables.")] = False,
 ) -> int:
     """Go through a recorded case step by step; with --method, what another one would have said."""
     if method is not None and method not in METHODS:
-        raise ReplayError(f"no method {method!r}; known: {', '.join(METHODS)}")
+        raise ReplayError(f"unknown method {method!r}; known: {', '.join(METHODS)}")
     with CaseRecord(case) as record:
         events = record.verify().events
         procedures = [replay_procedure(record, row) for row in record.procedures()]
@@ -97,7 +97,7 @@ def replay(
         _print(events, procedures, measurements)
     if all(row.agrees for row in procedures):
         return 0
-    print("autospine: a procedure does not take its recorded steps", file=sys.stderr)
+    print("autospine: a procedure does not repeat its recorded steps", file=sys.stderr)
     return COULD_NOT
 
 
@@ -111,7 +111,7 @@ def replay_procedure(record: CaseRecord, row: Procedure) -> ReplayedProcedure:
         step = next(procedure)
         for number, known in enumerate(steps):
             if not same_step(known, step):
-                ended = f"takes another step {number}"
+                ended = f"takes a different step {number}"
                 break
             if known.outcome is None:
                 break
@@ -218,7 +218,7 @@ def _print(
     from rich.table import Table
 
     console = Console()
-    console.print(f"{events} events, their chain verifies")
+    console.print(f"{events} events, the event chain verifies")
     table = Table("procedure", "", "recorded", "steps", "replayed", "agrees")
     for one in procedures:
         agrees = "yes" if one.agrees else "NO"

@@ -67,7 +67,7 @@ def report_page(record: CaseRecord) -> str:
     """The whole page as HTML; it loads nothing."""
     case = record.case()
     if case is None:
-        raise ReportError(f"{record.case_dir}: no case was begun here")
+        raise ReportError(f"{record.case_dir}: no case here")
     whole = record.verify()
     described = record.last_event("case_described")
     name = (described.body.get("label") if described else "") or case.name
@@ -76,8 +76,8 @@ def report_page(record: CaseRecord) -> str:
         f"<h1>{html.escape(title)}</h1>",
         '<p class="warning">Research software, not a medical device.</p>',
         (
-            f"<p>Case {html.escape(case.case_uid)}, {whole.events} events; the record "
-            f"verifies, its head is <code>{whole.head}</code>.</p>"
+            f"<p>Case {html.escape(case.case_uid)}, {whole.events} events; the record verifies; "
+            f"its head is <code>{whole.head}</code>.</p>"
         ),
         *case_table(record),
         *punctures(record),
@@ -220,7 +220,7 @@ def _plots(record: CaseRecord) -> Iterable[str]:
     axes.set(xlabel="measurement", ylabel="distance to target, mm", yscale="log")
     axes.grid(visible=True, which="both", alpha=0.3)
     yield "<h2>Distance to the target</h2>"
-    yield image_tag(figure, "distance to the target over the measurements")
+    yield image_tag(figure, "distance to the target, measurement by measurement")
 
 
 def _images(record: CaseRecord) -> Iterable[str]:
@@ -236,7 +236,7 @@ def _images(record: CaseRecord) -> Iterable[str]:
             if tag:
                 shown.append(tag)
     if shown:
-        yield "<h2>Where the fiducial was seen at the end of each approach</h2>"
+        yield "<h2>Fiducial position at the end of each approach</h2>"
         yield from shown
 
 
@@ -314,7 +314,7 @@ def _set_aside(record: CaseRecord) -> Iterable[str]:
         for row in record.slices(state="quarantined")
     ]
     if rows:
-        yield "<h2>Slices that were set aside</h2>"
+        yield "<h2>Slices set aside</h2>"
         yield html_table(("slice", "received", "code", "reason"), rows)
 
 
@@ -323,5 +323,5 @@ def _event_list(record: CaseRecord) -> Iterable[str]:
         (event.event_id, time_text(event.wall_s), event.source, event.who, event.kind)
         for event in record.newest_events(500)
     ]
-    yield "<h2>Events (the newest 500)</h2>"
+    yield "<h2>Events (latest 500)</h2>"
     yield html_table(("no.", "time", "source", "who", "what"), sorted(rows))

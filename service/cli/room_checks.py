@@ -58,8 +58,8 @@ def _waits(room: Config) -> Iterator[str]:
     least_s = listener.guard_s + (listener.clock_uncertainty_s if known else 0.0)
     if not room.service.settle_s >= least_s:
         yield (
-            f"key service.settle_s: {room.service.settle_s:g} s is less than the guard and the "
-            f"clock uncertainty together ({least_s:g} s): no slice could be proved "
+            f"key service.settle_s: {room.service.settle_s:g} s is less than the guard plus the "
+            f"clock uncertainty ({least_s:g} s): no slice could be proved "
             "to belong to its hold"
         )
 
@@ -79,5 +79,5 @@ def _axes(room: Config, bridge: BridgeConfig) -> Iterator[str]:
             if not abs(move_mm) <= high_mm - low_mm:
                 yield (
                     f"key {key.rsplit('.', 1)[0]}.calibration_move_mm: {move_mm:g} mm do not fit "
-                    f"into the travel of {name} ({low_mm:g} to {high_mm:g} mm)"
+                    f"in the travel of {name} ({low_mm:g} to {high_mm:g} mm)"
                 )

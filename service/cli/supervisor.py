@@ -1,7 +1,8 @@
 """`autospine up`: the control-room computer's listener, worker and service, supervised.
 
 A child that ends is started again, after a pause that grows while it keeps ending, for as long as
-the room runs: no child's end ever ends another. The service, which has STOP, is the last to go.
+the room runs: no child's end ever ends another. One that hangs is killed, and started again like
+any other. The service, which has STOP, is the last to go.
 The same policy as systemd units: `examples/systemd/`.
 """
 
@@ -17,6 +18,7 @@ import structlog
 import typer
 
 from case_record.cases import Cases
+from case_record.presence import Hanging
 from room_config.exit_codes import BAD_INPUT
 from room_config.load import load_config
 from room_config.shell import announce, autospine, configure_logs, on_parent_gone
@@ -27,6 +29,9 @@ PROCESSES = ("listener", "worker", "service")
 FIRST_PAUSE_S = 0.5
 LONGEST_PAUSE_S = 10.0
 END_S = 1.5
+# longer than any unit of work takes between two beats
+HUNG_S = 30.0
+_MOST_START_S = 120.0
 _STABLE_S = 30.0
 _LOOK_S = 0.1
 _ROTATE_EVERY_S = 5.0
@@ -36,7 +41,7 @@ _ROTATE_EVERY_S = 5.0
 def up(
     config: Annotated[Path, typer.Option("--config", help="The room's TOML file.")],
     exit_with_parent: Annotated[
-        bool, typer.Option("--exit-with-parent", help="End when standard input is closed.")
+        bool, typer.Option("--exit-with-parent", help="Exit when standard input is closed.")
     ] = False,
 ) -> None:
     """Run listener, worker and service; one that ends is started again."""
@@ -48,22 +53,26 @@ def up(
         signal.signal(number, lambda *_: stop.set())
     if exit_with_parent:
         on_parent_gone(stop.set)
-    family = Family(Cases(*room.room.folders).home / "logs")
+    home = Cases(*room.room.folders).home
+    family = Family(home / "logs")
+    hanging = Hanging(home, "up", HUNG_S)
     kept = [Kept(family, name, autospine(name, "--config", str(config))) for name in PROCESSES]
     try:
-        _keep(family, kept, stop)
+        _keep(family, kept, hanging, stop)
     finally:
         # nobody is waited for who does not come: a child that hangs is killed
         family.end_all([name for name in PROCESSES if name != "service"], END_S / 2)
         family.end_all(["service"], END_S / 2)
+        hanging.close()
 
 
-def _keep(family: Family, kept: list[Kept], stop: threading.Event) -> None:
+def _keep(family: Family, kept: list[Kept], hanging: Hanging, stop: threading.Event) -> None:
     """Look after the children until `stop`; the ready line is said once all of them are."""
     told, rotated_s = False, time.monotonic()
     while not stop.is_set():
+        hung = hanging.look(PROCESSES)
         for one in kept:
-            one.look(was_ready=told)
+            one.look(was_ready=told, hangs=one.name in hung)
         if not told and all(one.is_ready for one in kept):
             told = True
             facts = {one.name: family.children[one.name].ready for one in kept}
@@ -90,11 +99,18 @@ class Kept:
     def is_ready(self) -> bool:
         return self._runs and bool(self._family.children[self.name].ready)
 
-    def look(self, *, was_ready: bool) -> None:
-        """Start it if it is due. ChildError if it can never run, which shows at the first start."""
+    def look(self, *, was_ready: bool, hangs: bool = False) -> None:
+        """Start it if it is due. ChildError if it can never run, which shows at the first start.
+
+        hangs: it runs, and does nothing any more.
+        """
         now_s = time.monotonic()
         if self._runs:
             child = self._family.children[self.name]
+            if hangs or (not child.ready and now_s - self._started_s > _MOST_START_S):
+                structlog.get_logger().error("a process hangs: killed", process=self.name)
+                child.process.kill()
+                child.process.wait()
             code = child.process.poll()
             if code is None:
                 return

@@ -14,14 +14,14 @@ from service.web.access import new_token, token_hash
 
 
 def token(
-    name: Annotated[str, typer.Argument(help="Who; stands in the record with every action.")],
+    name: Annotated[str, typer.Argument(help="Name; recorded with every action.")],
     role: Annotated[str, typer.Option(help="viewer or operator")] = "viewer",
     expires: Annotated[str, typer.Option(help="Last day, YYYY-MM-DD (UTC).")] = "",
 ) -> None:
     """Make a token. It is shown once; the room's file gets its hash only."""
     secret = new_token()
     known = _checked(name, role, expires, token_hash(secret))
-    print(f"# The token of {known.name}. Hand it over in private; it is not kept anywhere:")
+    print(f"# The token of {known.name}. Hand it over privately; it is not stored anywhere:")
     print(secret)
     print("# For the room's file:")
     print("[[service.token]]")
@@ -40,7 +40,7 @@ def _checked(name: str, role: str, expires: str, sha256: str) -> AccessToken:
         first = error.errors()[0]
         raise ConfigError(f"token: {first['loc'][0]}: {first['msg']}") from None
     if known.expires is not None and known.expires < _today():
-        raise ConfigError(f"token: expires: {known.expires} is over already")
+        raise ConfigError(f"token: expires: {known.expires} is in the past")
     return known
 
 

@@ -39,13 +39,13 @@ def items_of(clock: ClockFinding, imaging: ImagingFinding) -> list[Item]:
             clock.uncertainty_s <= _MOST_UNCERTAIN_S,
         ),
         Item(
-            "Acquisition times against start and end as pressed",
+            "Acquisition times against the key presses at start and end",
             "agree" if not clock.untruthful_s else f"contradict by {clock.untruthful_s:.2f} s",
-            "agree within a person's reaction",
+            "agree within a person's reaction time",
             not clock.untruthful_s,
         ),
         Item(
-            "A slice comes after its acquisition",
+            "Delay of a slice after its acquisition",
             f"{promptness.least_s:.2f} to {promptness.most_s:.2f} s",
             f"within {_LATEST_S:g} s",
             promptness.most_s <= _LATEST_S,
@@ -54,7 +54,7 @@ def items_of(clock: ClockFinding, imaging: ImagingFinding) -> list[Item]:
             Item(
                 f"Protocol {protocol}: delays of {len(delays)} slices",
                 f"{min(delays):.2f} / {sorted(delays)[len(delays) // 2]:.2f} / {max(delays):.2f} s",
-                "least / median / most",
+                "min / median / max",
                 None,
             )
             for protocol, delays in clock.delays_s.items()
@@ -65,7 +65,7 @@ def items_of(clock: ClockFinding, imaging: ImagingFinding) -> list[Item]:
 
 def _imaging_items(found: ImagingFinding) -> list[Item]:
     psf = "not certain" if found.psf is None else _psf_words(found)
-    corrected = {True: "corrected", False: "not corrected", None: "the header does not say"}
+    corrected = {True: "corrected", False: "not corrected", None: "not in the header"}
     return [
         Item(
             "Point spread",
@@ -90,20 +90,20 @@ def _imaging_items(found: ImagingFinding) -> list[Item]:
             found.chi2_per_dof <= _MOST_CHI2,
         ),
         Item(
-            "Scatter of the centre, beside what each localization says",
+            "Scatter of the centre against the reported σ",
             f"{found.scatter_px:.4f} px, {found.sigma_px:.4f} px",
             f"at most {_MOST_SCATTER:g} of it",
             found.scatter_px <= _MOST_SCATTER * found.sigma_px,
         ),
         Item(
-            "Pixel size by the header", "{:g} x {:g} mm".format(*found.spacing_mm), "square",
+            "Pixel size from the header", "{:g} x {:g} mm".format(*found.spacing_mm), "square",
             math.isclose(*found.spacing_mm, rel_tol=1e-3),
         ),
         Item("Distortion", corrected[found.distortion_corrected], "", None),
         Item(
-            "Oil along the readout",
+            "Oil shift along the readout",
             f"{found.oil_shift_px:+.3f} ± {found.oil_sigma_px:.3f} px, polarity {found.polarity}",
-            f"{found.oil_expected_px:.3f} px by the header",
+            f"{found.oil_expected_px:.3f} px from the header",
             bool(found.polarity) and _is_as_expected(found),
         ),
     ]  # fmt: skip

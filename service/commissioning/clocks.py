@@ -51,7 +51,7 @@ def find_clock(series: Sequence[ScannedSeries]) -> ClockFinding:
     middle_s, half_s = (low_s + high_s) / 2, abs(high_s - low_s) / 2
     lags_s = _lags_s(series, certain=True)
     if not lags_s:
-        raise CommissioningError("no slice says how long its acquisition took: confirm each one")
+        raise CommissioningError("no slice gives the duration of its acquisition: confirm each one")
     seen = promptness_of([lag_s - middle_s for lag_s in lags_s])
     return ClockFinding(
         offset_s=middle_s,

@@ -67,11 +67,11 @@ def one_series(
     Raises CommissioningError where nothing came, or several series did.
     """
     if not receptions:
-        raise CommissioningError("no slice came: is the scanner's destination this computer?")
+        raise CommissioningError("no slice arrived: does the scanner send to this computer?")
     numbers = {r.header.series_instance_uid for r in receptions}
     if len(numbers) > 1:
         raise CommissioningError(
-            f"slices of {len(numbers)} series came between two presses: start one at a time"
+            f"slices of {len(numbers)} series arrived between two key presses: start one at a time"
         )
     in_order = sorted(receptions, key=lambda r: r.interval.start_s)
     return ScannedSeries(tuple(in_order), started, ended, reversed_readout)

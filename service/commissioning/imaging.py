@@ -101,7 +101,7 @@ def _fiducial(reception: Reception, imaging: ImagingConfig, psf: Psf | None) -> 
         start_px = _start(reception.pixels, imaging, radii)
         return localize(reception.pixels, start_px=start_px, radius_px=radii, psf=psf)
     except EngineError as error:
-        raise CommissioningError(f"the fiducial is not seen in a slice: {error}") from None
+        raise CommissioningError(f"the fiducial was not found in a slice: {error}") from None
 
 
 def _start(

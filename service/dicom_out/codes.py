@@ -52,8 +52,8 @@ PROBABILITY = own("p-within", "Probability that the distance is below the tolera
 TOLERANCE = own("tolerance", "Tolerance of the distance to the target")
 DEPTH = own("insertion-depth", "Insertion depth from guide face to needle tip")
 TARGET_AT = (
-    own("must-be-row", "Where the fiducial is to be, down the rows, from the centre"),
-    own("must-be-col", "Where the fiducial is to be, along the columns, from the centre"),
+    own("must-be-row", "Target of the fiducial, down the rows, from the centre"),
+    own("must-be-col", "Target of the fiducial, along the columns, from the centre"),
 )
 _METHODS = {
     "ml": "Maximum-likelihood fit of the imaged fiducial to all slices",

@@ -18,6 +18,7 @@ from service.procedure.plane import ImagePlane
 from service.procedure.registry import APPROACHES, GUIDE_APPROACH
 from service.procedure.targets import ENTRY_SET, TARGET_SET
 from service.room.history import targets_over_time
+from service.room.present import READY
 from sr_engine.worker import geometry_of
 
 
@@ -111,11 +112,10 @@ def finding_of_measurement(record: CaseRecord, measurement_id: int) -> Finding:
 
 
 def finding_of_arrival(record: CaseRecord, procedure_id: int) -> Finding:
-    """READY at the end of an approach. Raises CaseRecordError if that is not what it came to."""
-    known = (row for row in record.procedures() if row.procedure_id == procedure_id)
-    arrival = next(known, None)
-    if arrival is None or arrival.name not in APPROACHES or arrival.state != "done":
-        raise CaseRecordError(f"{record.case_dir}: procedure {procedure_id} did not come to READY")
+    """READY at the end of an approach. Raises CaseRecordError if that was never said of it."""
+    if procedure_id not in arrivals_said_ready(record):
+        raise CaseRecordError(f"{record.case_dir}: procedure {procedure_id} did not reach READY")
+    arrival = record.procedure(procedure_id)
     result = arrival.result or {}
     found = finding_of_measurement(record, int(result["measurement_id"]))
     distance = Distance(
@@ -130,12 +130,17 @@ def finding_of_arrival(record: CaseRecord, procedure_id: int) -> Finding:
     return Finding(**{**vars(found), **changes})
 
 
+def arrivals_said_ready(record: CaseRecord) -> list[int]:
+    """The approaches of which READY was said: not all that came to their end were."""
+    return [int(event.body["procedure_id"]) for event in record.events_of_kind(READY)]
+
+
 def finding_of_puncture(record: CaseRecord, event_id: int) -> Finding:
     """A recorded puncture. Raises CaseRecordError if that event is none."""
     known = (event for event in record.events_of_kind("puncture") if event.event_id == event_id)
     puncture = next(known, None)
     if puncture is None:
-        raise CaseRecordError(f"{record.case_dir}: event {event_id} is no puncture")
+        raise CaseRecordError(f"{record.case_dir}: event {event_id} is not a puncture")
     found = finding_of_arrival(record, int(puncture.body["procedure_id"]))
     return Finding(**{**vars(found), "puncture": puncture})
 

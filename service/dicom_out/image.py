@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import numpy as np
 from pydicom.dataset import Dataset
 
 from dicom_slice.geometry import SliceGeometry
@@ -11,6 +10,7 @@ from service.dicom_out.errors import OutputError
 from service.dicom_out.finding import Finding
 from service.dicom_out.identity import output_uid, series_uid, stamp
 from service.dicom_out.source import tidy_patient
+from service.room.images import load_reconstruction
 from sr_engine.frames import whole
 from sr_engine.reconstruction.reconstruct import Reconstruction
 from sr_engine.reconstruction.shiftset import condition_number, noise_factor
@@ -46,7 +46,7 @@ def fine_geometry(finding: Finding, factor: int) -> SliceGeometry:
 
 def _reconstruction(finding: Finding) -> Reconstruction:
     """As the worker made it, from the image and the shifts that the record keeps."""
-    image = np.load(finding.case_dir / finding.result["reconstruction"]).astype(np.float64)
+    image = load_reconstruction(finding.case_dir, finding.result)
     shape = finding.geometry.shape
     factor = int(image.shape[0]) // shape[0]
     shifts_px = finding.shifts_px

@@ -18,14 +18,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Literal
 
+from case_record.connection import is_older
 from case_record.record import CaseRecord, CaseRecordError
 from service.dicom_out.errors import OutputError
-from service.procedure.registry import APPROACHES
 
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
-from service.dicom_out.finding import Finding, plan_events
+from service.dicom_out.finding import Finding, arrivals_said_ready, plan_events
 
 FOLDER = "outputs"
 Kind = Literal["image", "report", "presentation", "plan"]
@@ -58,7 +58,9 @@ def output_of(name: str) -> Output:
     """Raises OutputError for what is no name of an output."""
     found = _NAME.fullmatch(name)
     if found is None:
-        raise OutputError(f"{name!r} is no output: SUBJECT-NUMBER-KIND is, as approach-5-report")
+        raise OutputError(
+            f"{name!r} is not an output; expected SUBJECT-NUMBER-KIND, such as approach-5-report"
+        )
     subject, number, kind = found.groups()
     if (subject == "plan") != (kind == "plan"):
         raise OutputError(f"{name!r} is no output: a plan is plan-NUMBER-plan")
@@ -74,10 +76,9 @@ def outputs_to_send(record: CaseRecord, after_measurement: int = 0) -> Iterator[
             if (row.result or {}).get("reconstruction"):
                 yield Output("measurement", row.measurement_id, "image")
         after_measurement = rows[-1].measurement_id
-    for procedure in record.procedures():
-        if procedure.name in APPROACHES and procedure.state == "done":
-            yield Output("approach", procedure.procedure_id, "report")
-            yield Output("approach", procedure.procedure_id, "presentation")
+    for procedure_id in arrivals_said_ready(record):
+        yield Output("approach", procedure_id, "report")
+        yield Output("approach", procedure_id, "presentation")
     for event in record.events_of_kind("puncture"):
         yield Output("puncture", event.event_id, "report")
     for event in plan_events(record):
@@ -87,10 +88,12 @@ def outputs_to_send(record: CaseRecord, after_measurement: int = 0) -> Iterator[
 def make_output(record: CaseRecord, output: Output) -> Path:
     """Return the file of the output, made now unless it lies there; durable when this returns.
 
-    Raises OutputError, CaseRecordError, OSError.
+    The record swears to what was made; what it does not swear to is made again. Raises OutputError,
+    CaseRecordError (TamperedError for a file that was changed), OSError.
     """
     path = output.path(record.case_dir)
-    if path.is_file():
+    name = str(path.relative_to(record.case_dir))
+    if path.is_file() and record.is_sealed(name):
         return path
     buffer = io.BytesIO()
     try:
@@ -103,7 +106,9 @@ def make_output(record: CaseRecord, output: Output) -> Path:
     except (AttributeError, TypeError, ValueError) as error:
         # so highdicom and pydicom say that a source's header cannot be used
         raise OutputError(f"{output.name}: {error}") from error
-    _write_once(path, buffer.getvalue())
+    if not record.read_only:
+        record.seal_file(name, buffer.getvalue())
+    _write(path, buffer.getvalue())
     return path
 
 
@@ -145,21 +150,19 @@ def _finding(record: CaseRecord, output: Output) -> Finding:
     return find(record, output.number)
 
 
-def _write_once(path: Path, content: bytes) -> None:
-    """Whoever comes first with a file of this name wins; it is whole and on disk, or not there."""
-    path.parent.mkdir(exist_ok=True)
+def _write(path: Path, content: bytes) -> None:
+    """Whole and on disk, or not there; who comes at the same time writes the same."""
+    path.parent.mkdir(exist_ok=True, mode=0o700)
     number, part = tempfile.mkstemp(prefix=f"{path.stem}-", suffix=".part", dir=path.parent)
     try:
         with os.fdopen(number, "wb") as file:
             file.write(content)
             file.flush()
             os.fsync(file.fileno())
-        try:
-            os.link(part, path)
-        except FileExistsError:
-            return
-    finally:
+        os.replace(part, path)
+    except BaseException:
         os.unlink(part)
+        raise
     folder = os.open(path.parent, os.O_RDONLY)
     try:
         os.fsync(folder)
@@ -171,7 +174,7 @@ def main(words: list[str]) -> int:
     """Make one output; the last line on standard error says why not."""
     case_dir, name = words
     try:
-        with CaseRecord(Path(case_dir), read_only=True) as record:
+        with CaseRecord(Path(case_dir), read_only=is_older(Path(case_dir))) as record:
             print(make_output(record, output_of(name)))
     except (OutputError, CaseRecordError, OSError) as error:
         print(error, file=sys.stderr)

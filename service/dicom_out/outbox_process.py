@@ -13,6 +13,7 @@ import signal
 import sys
 import threading
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import structlog
@@ -26,9 +27,8 @@ from room_config.shell import configure_logs, on_parent_gone
 from service.dicom_out.errors import OutputError
 from service.dicom_out.make import Output, make_output, outputs_to_send
 from service.dicom_out.outbox_sender import Sender
-from service.dicom_out.outbox_store import OutboxStore, cases_with_open_deliveries
+from service.dicom_out.outbox_store import PRESENCE, OutboxStore, cases_with_open_deliveries
 
-PRESENCE = "outbox"
 _LOOK_S = 0.25
 _AGAIN_S = 10.0
 _END_S = 2.0
@@ -48,8 +48,10 @@ class Maker:
         self._again_s = 0.0
         self._after = 0
 
-    def look(self) -> None:
-        """Make whatever is new; what the disk did not take is tried again after a while."""
+    def look(self, beat: Callable[[], None]) -> None:
+        """Make whatever is new, with a `beat` before each; what the disk did not take is tried
+        again after a while.
+        """
         now = self._record.change_count()
         if now == self._seen or time.monotonic() < self._again_s:
             return
@@ -57,6 +59,7 @@ class Maker:
         new = outputs_to_send(self._record, self._after)
         wanted = [one for one in new if one.name not in self._known]
         for output in wanted:
+            beat()
             takers = [name for name, kinds in self._kinds.items() if output.kind in kinds]
             if takers and not self._make(output, takers):
                 self._again_s = time.monotonic() + _AGAIN_S
@@ -112,9 +115,9 @@ class CaseOutbox:
         for sender in self._senders:
             sender.start()
 
-    def look(self) -> None:
+    def look(self, beat: Callable[[], None]) -> None:
         """Make what is new."""
-        self._maker.look()
+        self._maker.look(beat)
 
     def is_alive(self) -> bool:
         return all(sender.is_alive() for sender in self._senders)
@@ -148,7 +151,7 @@ def serve(config: Config, stop: threading.Event) -> None:
                         outboxes[folder] = CaseOutbox(config, folder)
                 waiting.clear()
                 for folder, outbox in list(outboxes.items()):
-                    outbox.look()
+                    outbox.look(presence.beat)
                     if not outbox.is_alive():
                         return
                     if folder != now and outbox.is_done():

@@ -105,8 +105,8 @@ def _why_not(association: Association) -> str:
         answer = association.acceptor.primitive
         return f"association rejected: {answer.reason_str if answer else 'no reason given'}"
     if association.acceptor.primitive is not None:
-        return "association aborted: no kind of object of ours is accepted"
-    return "nobody there, or no answer in time"
+        return "association aborted: none of our object types is accepted"
+    return "no response"
 
 
 def _store(association: Association, name: str, file: Path) -> Attempt:
@@ -122,7 +122,7 @@ def _store(association: Association, name: str, file: Path) -> Attempt:
     except (ValueError, RuntimeError) as error:
         return Attempt(name, Outcome.LATER, str(error))
     if "Status" not in answer:
-        return Attempt(name, Outcome.LATER, "no answer: the association was broken or timed out")
+        return Attempt(name, Outcome.LATER, "no response: the association was broken or timed out")
     return _judge(name, int(answer.Status), str(answer.get("ErrorComment", "") or ""))
 
 

@@ -112,7 +112,7 @@ class Sender:
     def _line_failed(self, store: OutboxStore, reason: str) -> None:
         self._line.failed()
         store.note_line(self._destination.name, reason)
-        log.warning("destination out of reach", destination=self._destination.name, reason=reason)
+        log.warning("destination unreachable", destination=self._destination.name, reason=reason)
 
     def _note(
         self, store: OutboxStore, record: CaseRecord, before: Delivery, attempt: Attempt

@@ -18,6 +18,7 @@ from case_record.cases import Cases
 from service.dicom_out.make import FOLDER
 
 FILE_NAME = "outbox.sqlite"
+PRESENCE = "outbox"
 State = Literal["waiting", "sent", "refused", "not_made"]
 STATES: tuple[State, ...] = ("waiting", "sent", "refused", "not_made")
 _BUSY_TIMEOUT_S = 10.0

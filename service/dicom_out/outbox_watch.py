@@ -17,8 +17,15 @@ from prometheus_client.core import GaugeMetricFamily
 from prometheus_client.registry import Collector
 
 from case_record.cases import Cases
+from case_record.presence import Hanging
 from room_config.load import Config
-from service.dicom_out.outbox_store import STATES, Line, OutboxStore, cases_with_open_deliveries
+from service.dicom_out.outbox_store import (
+    PRESENCE,
+    STATES,
+    Line,
+    OutboxStore,
+    cases_with_open_deliveries,
+)
 from service.room.alarms import Condition
 
 _LOOK_S = 0.5
@@ -26,6 +33,7 @@ _RESTART_S = 1.0
 _LONGEST_RESTART_S = 60.0
 _STABLE_S = 60.0
 _END_S = 5.0
+_HUNG_S = 60.0
 log = structlog.get_logger()
 
 
@@ -62,7 +70,7 @@ class OutboxWatch(Collector):
         )
         reached = GaugeMetricFamily(
             "autospine_outbox_reached",
-            "1 unless the last try to reach the destination failed.",
+            "1 unless the last attempt to reach the destination failed.",
             labels=["destination"],
         )
         for name in self._names:
@@ -79,9 +87,12 @@ class OutboxWatch(Collector):
         with contextlib.suppress(sqlite3.Error, OSError):
             self._folders.update(cases_with_open_deliveries(self._cases))
         child = _Child(self._config)
+        hanging = Hanging(self._cases.home, "outbox-watch", _HUNG_S)
         try:
             while not self._closing.wait(_LOOK_S):
                 try:
+                    if hanging.look([PRESENCE]):
+                        child.kill()
                     child.keep_alive()
                     with contextlib.suppress(sqlite3.Error, OSError):  # looked at again soon
                         self._look()
@@ -90,6 +101,7 @@ class OutboxWatch(Collector):
                     log.exception("outbox watch")
         finally:
             child.end()
+            hanging.close()
 
     def _look(self) -> None:
         """At the open case, and at those before it of which something is still to be sent."""
@@ -115,13 +127,13 @@ class OutboxWatch(Collector):
             line = self._lines.get(name)
             since_s = None if line is None else line.failing_since_s
             if line and since_s and time.time() - since_s > self._config.outputs.alarm_after_s:
-                text = f"Nothing can be sent to {name}: {line.reason}"
-                what = "Check the destination and the network. It is tried again until it works."
+                text = f"Cannot send to {name}: {line.reason}"
+                what = "Check the destination and the network. Retrying until it succeeds."
                 yield Condition(f"destination_{name}", "warning", text, what)
             refused = self._counts.get((name, "refused"), 0)
             if refused:
                 text = f"{name} refused {refused} of our DICOM objects"
-                what = "See the outbox for the reasons. They are sent again now and then."
+                what = "See the outbox for the reasons. Sending is retried at intervals."
                 yield Condition(f"refused_{name}", "warning", text, what)
         if any(self._counts.get((name, "not_made"), 0) for name in self._names):
             text = "A DICOM object could not be made"
@@ -149,7 +161,7 @@ class _Child:
                 return
             self._forget()
             self._wait_s = min(max(_RESTART_S, 2 * self._wait_s), _LONGEST_RESTART_S)
-            self.problem = f"The outbox ended with {code}; it is started again"
+            self.problem = f"The outbox ended with {code}; restarting it"
             log.error("the outbox ended", code=code, again_s=self._wait_s)
             self._started_s = now_s
         if now_s >= self._started_s + self._wait_s:
@@ -168,6 +180,13 @@ class _Child:
         with contextlib.suppress(OSError):  # it has ended already: seen at the next look
             self._process.stdin.write(self._config.model_dump_json().encode() + b"\n")
             self._process.stdin.flush()
+
+    def kill(self) -> None:
+        """It runs and does nothing any more; seen as ended at the next look."""
+        log.error("the outbox hangs: killed")
+        if self._process is not None:
+            self._process.kill()
+            self._process.wait()
 
     def _forget(self) -> None:
         if self._process is not None and self._process.stdin is not None:

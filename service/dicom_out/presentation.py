@@ -38,10 +38,10 @@ from service.dicom_out.image import fine_geometry, has_image, image_of
 from service.dicom_out.source import source_of
 from service.procedure.estimate import axis_sigma
 
-FIDUCIAL = GraphicLayer("FIDUCIAL", 1, "Where the fiducial was measured")
-TARGET = GraphicLayer("TARGET", 2, "Where the fiducial is to be")
+FIDUCIAL = GraphicLayer("FIDUCIAL", 1, "Measured position of the fiducial")
+TARGET = GraphicLayer("TARGET", 2, "Target position of the fiducial")
 PLAN = GraphicLayer("PLAN", 3, "Displacement from the fiducial to its target")
-NOTES = GraphicLayer("NOTES", 4, "What it is, in words")
+NOTES = GraphicLayer("NOTES", 4, "Description in words")
 _CROSS = 0.5  # of the radius
 _HEAD = 0.25  # of the arrow's length
 _SERIAL = "-"
@@ -183,5 +183,5 @@ def _words(finding: Finding, drawing: Drawing) -> str:
             line += f", P(below {tolerance_um:.0f} um) = {distance.probability:.3f}"
         lines.append(line)
     if drawing.target_px is not None and not drawing.target_is_inside:
-        lines.append("The target lies outside of this image")
+        lines.append("The target lies outside this image")
     return "\r\n".join(lines)

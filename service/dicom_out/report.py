@@ -186,7 +186,8 @@ def comment_of(finding: Finding) -> str:
     subject, number = subject_of(finding)
     about = {
         "measurement": f"Measurement {number} of the fiducial on the needle guide.",
-        "approach": f"The needle guide stands at its target (READY, approach {number}).",
+        "approach": "The needle guide stood at its target when READY was said "
+        f"(approach {number}).",
         "puncture": f"A puncture was made (event {number}"
         + (f", recorded by {finding.puncture.who})." if finding.puncture else ")."),
     }[subject]

@@ -23,7 +23,7 @@ export const TEXTS = {
     unreachable: "The service cannot be reached yet. Still trying.",
     lost: (age) => `Connection lost: what you see is ${age} old. STOP is still sent, but use the stop switch at the robot.`,
     lostNow: "Connection lost. STOP is still sent, but use the stop switch at the robot.",
-    emergency: "EMERGENCY: robot stopped, drives parked and without power. See to the patient and the needle first. Re-arm to leave this state, then measure again: parking shifts the stages slightly.",
+    emergency: "EMERGENCY: robot stopped, drives parked and without power. Attend to the patient and the needle first. Re-arm to leave this state, then measure again: parking shifts the stages slightly.",
   },
 
   next: {
@@ -33,7 +33,7 @@ export const TEXTS = {
     hold: (hold, place, of, wanted) => `Robot position ${of > 1 ? `${place} of ${of} of this shift set (hold ${hold})` : `hold ${hold}`}. ${many(wanted, "more slice")} needed here.`,
     confirm: (mm) => `Confirm the move of ${mm} mm?`,
     confirmButton: "CONFIRM MOVE", rejectButton: "Reject", cancel: "Cancel",
-    arm: "Arm the robot", rearm: "Re-arm the robot", taken: (places, from) => `The stages are taken to stand at ${places}, from ${from}.`, standThere: (arm) => `They stand there: ${arm.toLowerCase()}`,
+    arm: "Arm the robot", rearm: "Re-arm the robot", taken: (places, from) => `Assumed stage positions: ${places} (${from}).`, standThere: (arm) => `They are there: ${arm.toLowerCase()}`,
     needleOut: "Needle withdrawn – unlock motion",
     puncture: "Record the puncture", depth: "Insertion depth, mm (optional)", punctured: "Puncture recorded.",
     approach: "Start the approach", pick: "Pick the target on the slice", calibrate: "Start the calibration", targetHere: "Set the target to where the fiducial is now",

@@ -189,9 +189,9 @@ def _check_there_and_back(
         way_mm = max(abs(place[axis] - first.setpoints_um[axis]) for place in places) / 1000
         if not abs(moved_mm - said_mm) <= _LARGEST_ASYMMETRY * way_mm:
             raise CalibrationError(
-                f"axis {axis}: the way out and the way back of {way_mm:g} mm differ by "
-                f"{abs(moved_mm - said_mm):.2f} mm, at most {_LARGEST_ASYMMETRY * way_mm:.2f} are "
-                "allowed: did a stage meet its stop, or stand elsewhere than was said?"
+                f"axis {axis}: moving {way_mm:g} mm out and back differed by "
+                f"{abs(moved_mm - said_mm):.2f} mm ({_LARGEST_ASYMMETRY * way_mm:.2f} "
+                "allowed): did a stage hit its stop, or was it not where it was declared?"
             )
 
 

@@ -91,8 +91,8 @@ def _check_shares(jacobian: ImageJacobian, geometry: GuideGeometry) -> None:
     if np.all(np.abs(found - swapped[:, None]) < np.abs(found - shares[:, None])):
         raise ProcedureFailedError(
             "fiducials_swapped",
-            "the two fiducials move as if they were taken for each other: check the slice "
-            "positions of the upper and the lower one",
+            "the two fiducials appear to be swapped: check the slice positions of the upper and "
+            "the lower one",
         )
     for number, axis in enumerate(jacobian.axes):
         for fiducial, (name, share) in enumerate(zip(names, shares, strict=True)):
@@ -102,7 +102,7 @@ def _check_shares(jacobian: ImageJacobian, geometry: GuideGeometry) -> None:
                 raise ProcedureFailedError(
                     "calibration",
                     f"axis {axis}: the {name} fiducial moved {length:.2f} mm per mm of setpoint, "
-                    f"expected {expected:.2f}; was the move seen?",
+                    f"expected {expected:.2f}; did the robot move?",
                 )
     for pair in ((0, 1), (2, 3)):
         _check_angle(jacobian, pair, shares if pair == (0, 1) else 1 - shares)
@@ -121,5 +121,5 @@ def _check_angle(jacobian: ImageJacobian, pair: tuple[int, int], shares: Array) 
         raise ProcedureFailedError(
             "calibration",
             f"axes {first} and {second} move the guide along lines only {angle_deg:.0f}° apart, "
-            f"expected at least {SMALLEST_ANGLE_DEG:.0f}°: is a cable in another axis's place?",
+            f"expected at least {SMALLEST_ANGLE_DEG:.0f}°: are two axis cables swapped?",
         )

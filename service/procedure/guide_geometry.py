@@ -83,8 +83,8 @@ def line_of_state(
     sine = float(np.linalg.norm(across))
     if not sine < _STEEPEST_SINE:
         raise GuideSeenWrongError(
-            f"the fiducials are seen {sine * geometry.between_mm:.1f} mm apart across the slices, "
-            f"which a guide with {geometry.between_mm:.1f} mm between them cannot show"
+            f"the fiducials appear {sine * geometry.between_mm:.1f} mm apart in the slice plane, "
+            f"which is impossible with {geometry.between_mm:.1f} mm between them on the guide"
         )
     upper_mm, lower_mm = geometry.slice_positions_mm
     along_normal = np.sign(upper_mm - lower_mm) * np.sqrt(1.0 - sine**2)

@@ -79,7 +79,7 @@ def guide_approach_of(
     )
     if not line.depth_mm <= guide.needle_reach_mm:
         raise TargetError(
-            f"it lies {line.depth_mm:.1f} mm below the lower ball joint, the needle reaches "
+            f"it lies {line.depth_mm:.1f} mm below the lower ball joint; the needle reaches "
             f"{guide.needle_reach_mm:g} mm"
         )
     geometry = replace(geometry_of(guide), tip_beyond_mm=line.depth_mm)

@@ -114,7 +114,7 @@ def show_that_it_follows(
     except PlanRefusedError as error:
         raise ProcedureFailedError("target_out_of_reach", str(error)) from error
     if arguments.confirm_moves:
-        yield from ask_to_confirm(f"{name}, to see it follow,", plan)
+        yield from ask_to_confirm(f"{name}, as a proof move,", plan)
     moved = yield from move(
         MoveTo(
             dict(plan.setpoints_um),
@@ -125,7 +125,7 @@ def show_that_it_follows(
     )
     predicted = seen.estimate.moved_to(moved.readback_um, seen.jacobian, gate.noise)
     there = yield from look(replace(seen, estimate=predicted))
-    text = f"what is seen does not move with the robot, it is not the {name}"
+    text = f"the object seen does not move with the robot, so it is not the {name}"
     try:
         check_prediction(predicted, there.found, gate)
     except ProcedureFailedError as error:

@@ -112,9 +112,10 @@ class ImageJacobian:
             allowed = _CHANGE_SIGMAS * np.sqrt(2.0) * scale_error * length
             if not change <= allowed:
                 raise CalibrationError(
-                    f"axis {axis}: the fiducial moves otherwise than at the last calibration of "
-                    f"this robot, by {change:.3f} mm per mm (allowed {allowed:.3f}): look for what "
-                    "is loose or in the way, and whether the stages stand where they are said to"
+                    f"axis {axis}: the fiducial's motion differs from the last calibration of "
+                    f"this robot by {change:.3f} mm per mm (allowed {allowed:.3f}): check "
+                    "for something loose or in the way, and that the stages are where "
+                    "they were declared"
                 )
 
     def check(self) -> None:
@@ -125,7 +126,7 @@ class ImageJacobian:
             if not low <= length <= high:
                 raise CalibrationError(
                     f"axis {self.axes[index // 2]}: the fiducial moved {length:.2f} mm per mm of "
-                    f"setpoint, expected {low} to {high}; was the move seen?"
+                    f"setpoint, expected {low} to {high}; did the robot move?"
                 )
         cosine = abs(self.columns[:, 0] @ self.columns[:, 2]) / (lengths[0] * lengths[2])
         angle_deg = float(np.degrees(np.arccos(min(1.0, cosine))))

@@ -42,7 +42,7 @@ class Line:
         lower, upper = np.asarray(lower_mm, dtype=float), np.asarray(upper_mm, dtype=float)
         length = float(np.linalg.norm(upper - lower))
         if not length > 1e-9:
-            raise KinematicsError(f"two points {length:g} mm apart make no line")
+            raise KinematicsError(f"two points {length:g} mm apart do not define a line")
         return cls(lower, (upper - lower) / length)
 
     def at(self, distance_mm: float) -> Array:
@@ -90,7 +90,7 @@ def parallel_planes(
 ) -> Mechanism:
     """Two stages above each other, axes alike; base and bottom frame are the same."""
     if not separation_mm > 0:
-        raise KinematicsError(f"the planes must be apart, separation is {separation_mm} mm")
+        raise KinematicsError(f"the planes must differ; their separation is {separation_mm} mm")
     top = np.eye(4)
     top[2, 3] = separation_mm
     return Mechanism(top, np.eye(4), travel_mm, guide_face_mm)
@@ -158,7 +158,7 @@ def _crossing(base_from_stage: Array, line: Line, name: str) -> Array:
     normal = turn[:, 2]
     sine = float(normal @ line.direction)
     if not abs(sine) > _PARALLEL_SINE:
-        raise KinematicsError(f"the line runs along the {name} stage's plane and never meets it")
+        raise KinematicsError(f"the line runs along the {name} stage's plane and never crosses it")
     point = line.at(float(normal @ (origin - line.point_mm)) / sine)
     return np.asarray((turn.T @ (point - origin))[:2])
 

@@ -24,10 +24,14 @@ class PlanRefusedError(Exception):
 
 @dataclass(frozen=True)
 class Travel:
-    """Travel limits of one axis, integer micrometres, both ends allowed."""
+    """Travel limits of one axis, integer micrometres, both ends allowed.
+
+    unsure_um: what was taken off both ends because it is not known better where the axis stands.
+    """
 
     min_um: int
     max_um: int
+    unsure_um: int = 0
 
 
 @dataclass(frozen=True)
@@ -106,13 +110,13 @@ def why_void(
         at_um = positions_um.get(axis)
         if at_um is None or not abs(at_um - planned_um) <= SAME_PLACE_UM:
             return (
-                f"the plan was made where axis {axis} stood at {planned_um / 1000:.3f} mm, now it "
-                f"stands at {'nowhere known' if at_um is None else f'{at_um / 1000:.3f} mm'}"
+                f"the plan was made with axis {axis} at {planned_um / 1000:.3f} mm; it is "
+                f"now at {'an unknown position' if at_um is None else f'{at_um / 1000:.3f} mm'}"
             )
     newer = rests_on is not None and (newest_measurement_id or 0) > rests_on
     if newer:
         return (
-            f"the plan rests on measurement {rests_on}, there is a newer one "
+            f"the plan rests on measurement {rests_on}; there is a newer one "
             f"({newest_measurement_id})"
         )
     return ""
@@ -142,7 +146,12 @@ def check_travel(setpoints_um: Mapping[str, int], travel: Mapping[str, Travel]) 
             raise PlanRefusedError(f"axis {axis} has no travel limits")
         limits = travel[axis]
         if not limits.min_um <= setpoint_um <= limits.max_um:
+            unsure = (
+                f" (its position is known only to within {limits.unsure_um / 1000:.3f} mm, and the "
+                "travel is narrowed by that: measure, home it or declare its position)"
+            )
             raise PlanRefusedError(
                 f"axis {axis}: setpoint {setpoint_um / 1000:.3f} mm is outside its travel "
                 f"{limits.min_um / 1000:.3f} to {limits.max_um / 1000:.3f} mm"
+                f"{unsure if limits.unsure_um else ''}"
             )

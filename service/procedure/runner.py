@@ -83,8 +83,8 @@ def _carry_out(
     known = record.send_step(procedure_id, number, kind, body)
     if not same_step(known, step):
         raise ReplayMismatchError(
-            f"step {number} of procedure {procedure_id} is recorded as {known.kind}, this program "
-            f"would take another one ({kind}); the procedure must be started anew"
+            f"step {number} of procedure {procedure_id} is recorded as {known.kind}, but this "
+            f"version of the program would take {kind}; start the procedure again"
         )
     if known.outcome is not None:
         return outcome_from_json(kind, known.outcome)

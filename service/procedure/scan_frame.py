@@ -13,7 +13,8 @@ from typing import Any
 
 from case_record.record import CaseRecord
 from case_record.rows import Measurement
-from dicom_listener.belonging import ACCEPTED, BOUND, after_event
+from dicom_listener.belonging import ACCEPTED, BOUND, HELD, SAME_PATIENT, after_event
+from dicom_slice.reasons import Reason
 
 CASE_REOPENED = "case_reopened"
 _SAME_SHARE = 1e-3
@@ -46,9 +47,9 @@ class ScanFrame:
     def other_place(self, other: ScanFrame) -> str:
         """What says that positions of the two need not be comparable; empty if nothing does."""
         if _differ(self.frame_of_reference, other.frame_of_reference):
-            return "another frame of reference"
+            return "a different frame of reference"
         if _differ(self.study, other.study):
-            return "another study"
+            return "a different study"
         return ""
 
     def other_protocol(self, other: ScanFrame) -> str:
@@ -59,19 +60,19 @@ class ScanFrame:
         ):
             if mine is None or others is None:
                 if mine is not others:
-                    return f"a {name} where the other says none"
+                    return f"a {name} where the others have none"
             elif not abs(mine - others) <= _SAME_SHARE * abs(mine):
-                return f"another {name} ({others:g} instead of {mine:g})"
+                return f"a different {name} ({others:g} instead of {mine:g})"
         if self.phase_encoding_direction != other.phase_encoding_direction:
             return (
-                f"another phase encoding direction ({other.phase_encoding_direction or 'unknown'} "
+                "a different phase encoding direction "
+                f"({other.phase_encoding_direction or 'unknown'} "
                 f"instead of {self.phase_encoding_direction or 'unknown'})"
             )
         return ""
 
 
-STUDY_ACCEPTED, SLICE_HELD = "study_accepted", "slice_held"
-OTHER_PATIENT, OTHER_STUDY = "other_patient", "other_study"
+STUDY_ACCEPTED = "study_accepted"
 
 
 def newest_frame(record: CaseRecord) -> ScanFrame | None:
@@ -84,6 +85,13 @@ def frame_of(record: CaseRecord, measurement: Measurement) -> ScanFrame | None:
     """Of the slices that were measured; None where the record does not say."""
     slice_id = (measurement.result or {}).get("slice_id")
     return None if slice_id is None else ScanFrame.of_header(record.slice(int(slice_id)).header)
+
+
+def seen_seq(record: CaseRecord, measurement: Measurement) -> int:
+    """From when on a measurement knows the scanner: its first slice, in the record's order."""
+    slices = (measurement.result or {}).get("slice_ids", ())
+    came = (record.slice(int(slice_id)).seq for slice_id in slices)
+    return min(came, default=measurement.requested_seq)
 
 
 def other_place_since(record: CaseRecord, seq: int, frame: ScanFrame) -> str:
@@ -101,17 +109,27 @@ def other_place_since(record: CaseRecord, seq: int, frame: ScanFrame) -> str:
         if other := frame.other_place(ScanFrame(study, reference)):
             return other
     for came in record.scans_since(seq):
-        if came["reason_code"] == OTHER_PATIENT:
-            continue  # somebody else's, on another table
+        if came["reason_code"] == Reason.OTHER_PATIENT:
+            continue  # nobody's places in this case: see `others_since`
         if other := frame.other_place(ScanFrame.of_header(came)):
             return other
     return ""
 
 
-def other_study_held_since(record: CaseRecord, seq: int) -> bool:
-    """Whether slices of another study of nobody else came, and wait outside of the case."""
-    held = record.events_of_kind(SLICE_HELD, after_seq=seq)
-    return any(event.body.get("code") == OTHER_STUDY for event in held)
+def others_since(record: CaseRecord, seq: int) -> str:
+    """Of whom else slices came after `seq` that wait outside of the case, or lie aside in it, and
+    say that the table, or who lies on it, may have changed; empty if none did.
+
+    What is pushed late of another patient's earlier case says nothing of the table.
+    """
+    for event in record.events_of_kind(HELD, after_seq=seq):
+        code = event.body.get("code")
+        if code == Reason.OTHER_PATIENT:
+            return "a different patient"
+        if code == Reason.OTHER_STUDY or event.body.get(SAME_PATIENT):
+            return "a different study"
+    came = record.scans_since(seq)
+    return "a different patient" * any(one["reason_code"] == Reason.OTHER_PATIENT for one in came)
 
 
 def _differ(mine: str, others: str) -> bool:

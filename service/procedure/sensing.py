@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dicom_slice.reasons import Reason
 from service.procedure.estimate import FiducialEstimate, MotionNoise, motion_covariance
@@ -89,7 +89,9 @@ def move(step: MoveTo) -> ProcedureSteps[Moved]:
         return moved
     if moved.state == "REFUSED":
         raise ProcedureFailedError(moved.code, f"the robot did not move: {moved.text}")
-    text = f"the robot was stopped on its way ({moved.text}): look where it stands, then start anew"
+    text = (
+        f"the robot was stopped during the move ({moved.text}): check where it is, then start again"
+    )
     raise ProcedureFailedError(moved.code, text)
 
 
@@ -265,14 +267,14 @@ def check_prediction(
     sigmas = predicted.distance_sigma(found.plane_mm, found.covariance_mm2)
     allowed = gate.gate_sigma
     if len(found.plane_mm) != 2:
-        allowed = math.sqrt(chi2.isf(chi2.sf(gate.gate_sigma**2, 2), len(found.plane_mm)))
+        allowed = math.sqrt(chdtri(len(found.plane_mm), math.exp(-(gate.gate_sigma**2) / 2)))
     if not sigmas <= allowed:
         miss = found.plane_mm - predicted.plane_mm
         listed = ", ".join(f"{value:+.3f}" for value in miss)
         raise ProcedureFailedError(
             "prediction_missed",
-            f"the fiducial is ({listed}) mm (row, col) from where the move should have brought "
-            f"it, {sigmas:.1f} σ (allowed {allowed:.1f}, repeatability "
+            f"the fiducial is ({listed}) mm (row, col) from where the move should have taken it, "
+            f"{sigmas:.1f} σ (allowed {allowed:.1f}, repeatability "
             f"{gate.repeatability_mm * 1000:.0f} µm): calibrate again",
         )
 

@@ -15,7 +15,8 @@ from service.procedure.scan_frame import (
     frame_of,
     newest_frame,
     other_place_since,
-    other_study_held_since,
+    others_since,
+    seen_seq,
 )
 
 POSITION_DECLARED = "position_declared"
@@ -89,11 +90,11 @@ def _is_another_scan(record: CaseRecord, measurement: Measurement) -> bool:
     frame, newest = frame_of(record, measurement), newest_frame(record)
     if frame is None or newest is None:
         return False
-    since = measurement.requested_seq
+    since = seen_seq(record, measurement)
     return bool(
         frame.other_protocol(newest)
         or other_place_since(record, since, frame)
-        or other_study_held_since(record, since)
+        or others_since(record, since)
     )
 
 

@@ -175,7 +175,7 @@ def _prove(
 ) -> ProcedureSteps[Standing[LookT]]:
     """Move by part of a pixel: what is seen must go with it; raises ProcedureFailedError if not."""
     if standing.proofs == _MOST_PROOFS:
-        text = f"the {steered.name} was not seen to move with the robot: is it in the slice?"
+        text = f"the {steered.name} did not move with the robot in the images: is it in the slice?"
         raise ProcedureFailedError("identity", text)
     calibration = standing.calibration
     plan_id = f"{calibration.measurement_id}.{standing.iterations}"
@@ -184,14 +184,14 @@ def _prove(
     except PlanRefusedError as error:
         raise ProcedureFailedError("target_out_of_reach", str(error)) from error
     if steered.arguments.confirm_moves:
-        yield from ask_to_confirm(f"{steered.name}, to see it follow,", plan)
+        yield from ask_to_confirm(f"{steered.name}, as a proof move,", plan)
     standing = replace(standing, proofs=standing.proofs + 1)
     try:
         return (yield from _go(steered, standing, plan, way, PROOF))
     except ProcedureFailedError as error:
         if error.code != "prediction_missed":
             raise
-        text = f"what is seen does not move with the robot, it is not the fiducial: {error}"
+        text = f"the object seen does not move with the robot, so it is not the fiducial: {error}"
         raise ProcedureFailedError("identity", text) from error
 
 

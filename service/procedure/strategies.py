@@ -129,5 +129,5 @@ def look_longer(
 def _check_plane(measured: Measured, plane: ImagePlane) -> None:
     if not ImagePlane.from_json(measured.plane).is_parallel_to(plane):
         raise ProcedureFailedError(
-            "plane_changed", "the slice orientation is not that of the calibration"
+            "plane_changed", "the slice orientation differs from the calibration's"
         )

@@ -77,9 +77,9 @@ def target_that_can_be_taken(record: CaseRecord, number: int) -> Target:
     """A target of the case by its number. TargetError where it is none, or none any more."""
     event = next((e for e in record.events_of_kind(TARGET_SET) if e.event_id == number), None)
     if event is None:
-        raise TargetError(f"this case has no target number {number}")
+        raise TargetError(f"this case has no target {number}")
     if event.seq <= places_good_since(record):
-        raise TargetError("it was set before the table was moved: pick it again on new slices")
+        raise TargetError("it was set before the table moved; pick it again on new slices")
     return target_of(event)
 
 
@@ -109,8 +109,8 @@ def why_void_target(record: CaseRecord, target: Target) -> str:
     if not other:
         return ""
     return (
-        f"slices of {other} have come since the target was set, the table may have moved: "
-        "pick it again on the new slices"
+        f"slices from {other} have arrived since the target was set and the table may have "
+        "moved; pick it again on the new slices"
     )
 
 
@@ -162,7 +162,8 @@ def fiducial_must_appear_at(
         return place + now - oil_shift_mm(vars(target.frame), plane.spacing_mm, polarity)
     except TargetError as error:
         raise TargetError(
-            f"it was set on other slices, the newest have {other}: {error}; set it again on these"
+            f"it was set on other slices and the newest have {other}: {error}; set it again on "
+            "these"
         ) from error
 
 
@@ -191,8 +192,8 @@ def needle_line(
 ) -> NeedleLine:
     """The guide's line through entry and target (patient mm), for planes along the slice normal.
 
-    Raises TargetError for points that make no line, one that is too flat, or a target that does not
-    lie below the lower ball joint.
+    Raises TargetError for points that do not define a line, a line that is too flat, or a target
+    that does not lie below the lower ball joint.
     """
     try:
         line = line_from_entry_and_target(entry_mm, target_mm)
@@ -200,7 +201,7 @@ def needle_line(
         raise TargetError(f"entry and target: {error}") from error
     along = float(plane.normal @ line.direction)
     if not abs(along) > 0.5:
-        raise TargetError("the needle would lie flatter than 30° to the slices")
+        raise TargetError("the needle would be less than 30° from the slice plane")
     direction = line.direction * np.sign(along) * np.sign(upper_plane_mm - lower_plane_mm)
     depth_mm = (lower_plane_mm - float(plane.normal @ line.point_mm)) / float(
         plane.normal @ direction

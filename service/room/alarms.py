@@ -11,20 +11,21 @@ from service.room.state import AlarmState
 
 _SHOWN_S = 300.0
 _MOST_RAISED = 20
-_SEE_LOG = "See the log of the process that raised this."
+_SEE_LOG = "See the log of the process that raised this alarm."
 # what to do about what the listener raises, by its code
 _TO_DO = {
     "association_rejected": "Check AE titles and addresses at the scanner and in the room's file.",
     "clock_drift": "Compare the scanner clock again, then acquire the slices again.",
-    "contexts_refused": "Let the scanner send MR images uncompressed, as plain MR Image Storage.",
-    "disk_low": "Free space on the disk of the case folder.",
-    "foreign_file": "Look at the file in the inbox and take it away.",
+    "contexts_refused": "Set the scanner to send uncompressed MR Image Storage.",
+    "disk_low": "Free space on the disk that holds the case folder.",
+    "foreign_file": "Inspect the file in the inbox and remove it.",
     "intake_failed": "Acquire the slice again; see the listener's log.",
     "late_or_clock_jump": "Compare the scanner clock again, then acquire the slices again.",
-    "oversize": "Check what the scanner sends: no slice is that large.",
-    "same_uid_other_bytes": "Acquire the slice again; check what sends to this listener.",
+    "oversize": "Check what the scanner is sending: no slice is that large.",
+    "same_uid_other_bytes": "Acquire the slice again; check which systems send to this listener.",
     "slice_refused": "Send or acquire the slice again.",
-    "unfinished_files": "Nothing is lost: the scanner was not told that they arrived. Send again.",
+    "unfinished_files": "Nothing is lost: the scanner was never told that they had arrived. Send "
+    "them again.",
 }
 
 

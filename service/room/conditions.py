@@ -12,15 +12,15 @@ HANGS = "is not responding"
 # a procedure that the operator ended is no alarm
 _CHOSEN = frozenset({"rejected"})
 _AFTER_FAILURE = {
-    "prediction_missed": "See whether something pushed the guide, then calibrate again.",
-    "identity": "Look for the fiducial in the slice and check the slice position; then calibrate.",
+    "prediction_missed": "Check whether something pushed the guide, then calibrate again.",
+    "identity": "Check the slice position and that the slice shows the fiducial, then calibrate.",
     "not_converged": "Start the approach again; if it fails again, calibrate.",
-    "target_out_of_reach": "Set another target, or place the robot anew and calibrate.",
-    "other_place": "Set the target anew on the new slices; calibrate again where asked to.",
-    "other_protocol": "Start it again with these slices, or scan with the protocol of before.",
-    "plane_changed": "Scan with the orientation of the calibration, then start it again.",
-    "calibration": "See that every axis moves the guide, then calibrate again.",
-    "plan_void": "Start the approach again: it measures and plans anew.",
+    "target_out_of_reach": "Set another target, or reposition the robot and calibrate.",
+    "other_place": "Set the target again on the new slices; calibrate again if asked.",
+    "other_protocol": "Start again with these slices, or go back to the previous scan protocol.",
+    "plane_changed": "Scan with the slice orientation used for calibration, then start again.",
+    "calibration": "Check that every axis moves the guide, then calibrate again.",
+    "plan_void": "Start the approach again: it will measure and plan again.",
 }
 
 
@@ -44,8 +44,8 @@ def conditions(state: RoomState) -> list[Condition]:
             )
         )
     if robot.linked and robot.phase == WorkPhase.EMERGENCY:
-        text = f"EMERGENCY ({plain_words(robot.stop_reason)}): the drives are parked"
-        what = "See to the patient and the needle. Re-arm when it is safe, then measure again."
+        text = f"EMERGENCY ({plain_words(robot.stop_reason)}): drives parked"
+        what = "Attend to the patient and the needle. Re-arm when it is safe, then measure again."
         found.append(Condition("emergency", "alarm", text, what))
     elif robot.linked and robot.stopped:
         text = f"The robot is stopped ({plain_words(robot.stop_reason)})"
@@ -55,20 +55,22 @@ def conditions(state: RoomState) -> list[Condition]:
         found.append(Condition("position", "warning", text, "Re-arm, then measure."))
     if state.ready_lost is not None:
         text = f"READY was lost: {state.ready_lost.text}"
-        what = "Confirm that the needle is withdrawn, then start the approach: it measures again."
+        what = (
+            "Confirm that the needle is withdrawn, then start the approach: it will measure again."
+        )
         found.append(Condition("ready_lost", "alarm", text, what))
     if state.target_lost is not None:
         text = f"The target is void: {state.target_lost.text}"
         found.append(Condition("target_void", "alarm", text, "Pick the target on the new slices."))
     if state.last_failure is not None and state.last_failure not in _CHOSEN:
-        what = _AFTER_FAILURE.get(state.last_failure, "Read the reason, then start it again.")
+        what = _AFTER_FAILURE.get(state.last_failure, "See the reason, then start again.")
         text = state.last_outcome[:1].upper() + state.last_outcome[1:].replace("_", " ")
         found.append(Condition("procedure_failed", "alarm", text, what))
     for process in state.processes:
         if process.condition == "down" or process.detail == HANGS:
             text = f"The {process.name} {process.detail}"
             found.append(
-                Condition(f"{process.name}_lost", "alarm", text, f"Start the {process.name} again.")
+                Condition(f"{process.name}_lost", "alarm", text, f"Restart the {process.name}.")
             )
     if state.measurement is not None and state.measurement.state == "failed":
         text = f"Measurement failed: {state.measurement.reason}"

@@ -84,12 +84,17 @@ class Room:
         configured = self.config.service.guide
         if guide and configured is None:
             raise ConflictError(
-                "no_guide", "This room has no [service.guide] table: it steers two axes only."
+                "no_guide", "This room has no [service.guide] table: it controls two axes only."
             )
         return configured if guide or guide is None else None
 
     def travel(self) -> dict[str, Travel]:
-        return {axis: Travel(low, high) for axis, (low, high) in self.link.travel_left_um.items()}
+        status = self.link.status
+        unsure_um = status.bound_um if status else {}
+        return {
+            axis: Travel(low, high, unsure_um.get(axis, 0))
+            for axis, (low, high) in self.link.travel_left_um.items()
+        }
 
     def seed(self) -> int:
         """Of the next procedure's random choices: from the case's seed and its number."""
@@ -103,7 +108,7 @@ class Room:
         if calibration is None:
             raise ConflictError(
                 "not_calibrated",
-                "Calibrate first (a new frame of reference voids the calibration before).",
+                "Calibrate first (a new frame of reference voids any earlier calibration).",
             )
         status = self.linked()
         noise = gate_of(self.config).noise

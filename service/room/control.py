@@ -7,6 +7,7 @@ heartbeats that keep the bridge's deadman quiet leave only from this loop.
 
 from __future__ import annotations
 
+import contextlib
 import queue
 import threading
 import time
@@ -19,6 +20,7 @@ from typing import Any
 import structlog
 
 from case_record.cases import Cases, CasesError
+from case_record.presence import Presence
 from case_record.record import CaseRecord, CaseRecordError, RecordUnavailableError
 from case_record.rows import Procedure
 from room_config.load import Config
@@ -131,6 +133,7 @@ class ControlLoop:
         self._failed_at: tuple[int, str] | None = None
         self._said_s = -_SAID_AGAIN_S
         self._commands: Commands | BetweenCases | None = None
+        self._presence: Presence | None = None
         self._stops = StopLatch()
 
     @property
@@ -210,6 +213,8 @@ class ControlLoop:
         finally:
             self._link.client.close()
             self._commands = None
+            if self._presence is not None:
+                self._presence.close()
             if self._failure is not None:
                 self._on_failure()
 
@@ -307,7 +312,7 @@ class ControlLoop:
         """What else is wrong than the state shows."""
         if not self._record.doubt:
             return self._others_wrong()
-        what = "Nothing may rest on it. Keep the folder as it is and begin a new case."
+        what = "Do not rely on it. Keep the folder as it is and start a new case."
         changed = Condition("record_changed", "alarm", self._record.doubt, what)
         return [changed, *self._others_wrong()]
 
@@ -367,7 +372,7 @@ class ControlLoop:
 
     def _fail_by_program(self, running: Procedure, error: Exception) -> None:
         log.exception("procedure failed", procedure=running.name)
-        text = f"the program failed ({type(error).__name__}: {error}); its log says where"
+        text = f"internal error ({type(error).__name__}: {error}); see the log"
         self._end_procedure(running, "failed", text)
 
     def _end_procedure(self, running: Procedure, state: str, reason: str, code: str = "") -> None:
@@ -494,14 +499,18 @@ class ControlLoop:
     def _check(self, asked: _Asked, moving: bool) -> None:
         """Raise ConflictError for an order that may not be carried out now, or not any more."""
         if asked.name not in _ALWAYS and self._stops.voids(asked.asked_s):
-            text = "STOP was pressed after this was asked for: it is not done. Ask again."
+            text = (
+                "STOP was pressed after this was requested, so it was not carried out. Ask again."
+            )
             raise ConflictError("void_after_stop", text)
         age_s = time.monotonic() - asked.asked_s
         if asked.name not in _ALWAYS and not age_s <= OLDEST_ORDER_S:
-            text = f"This was asked for {age_s:.1f} s ago: it is not done any more. Ask again."
+            text = f"This was requested {age_s:.1f} s ago, so it was not carried out. Ask again."
             raise ConflictError("stale_order", text)
         if moving and asked.name not in _WHILE_MOVING:
-            raise ConflictError("moving", "The robot moves: wait until it stands, or press STOP.")
+            raise ConflictError(
+                "moving", "The robot is moving: wait until it stops, or press STOP."
+            )
 
     def _publish_if_due(self) -> bool:
         """Publish when something was recorded, and every now and then; whether it was done."""
@@ -521,7 +530,7 @@ class ControlLoop:
         except RECORD_FAULTS:
             raise
         except Exception as error:
-            wrong = f"The state cannot be told ({type(error).__name__}: {error})"
+            wrong = f"Cannot report the state ({type(error).__name__}: {error})"
             self._publish_held(Condition("state", "alarm", wrong, "See the log."), time.time())
             if time.monotonic() - self._said_s > _SAID_AGAIN_S:
                 self._said_s = time.monotonic()
@@ -534,12 +543,19 @@ class ControlLoop:
         self._show(held(self._state, robot, wrong, since_s))
 
     def _show(self, state: RoomState) -> None:
+        self._beat()
         self._published_at_s = time.monotonic()
         self._state = state
         if self._owed and (state.case_folder is None) == (self._folder_to_serve() is None):
             while self._owed:
                 future, result = self._owed.pop()
                 future.set_result(result)
+
+    def _beat(self) -> None:
+        """Whoever supervises the service sees that this loop turns."""
+        with contextlib.suppress(OSError):  # a disk that takes nothing
+            self._presence = self._presence or Presence(self._cases.home, "service")
+            self._presence.beat()
 
 
 class _UnusableError(Exception):

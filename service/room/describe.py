@@ -293,7 +293,7 @@ def _arrival(record: CaseRecord, found: Readiness | None, now: Now) -> ArrivalSt
 
 def _marked(arrival: ArrivalState | None) -> str:
     """An overrule is never out of sight where READY rests on it."""
-    return "" if arrival is None or not arrival.by_hand else " (rests on slices used by hand)"
+    return "" if arrival is None or not arrival.by_hand else " (relies on slices assigned by hand)"
 
 
 def _drives(config: Config, link: RoomLink) -> list[DriveState]:
@@ -347,12 +347,12 @@ def _error(
     """How far off it is now; if that is not known, why not."""
     last = record.last_measurement("done")
     if last is None:
-        return {"error": None, "error_reason": "nothing was measured yet"}
+        return {"error": None, "error_reason": "nothing measured yet"}
     lost = why_not_now(record, last, now)
     if lost is not None:
         return {"error": None, "error_reason": lost.text}
     if target is None:
-        return {"error": None, "error_reason": void or "no target is set"}
+        return {"error": None, "error_reason": void or "no target set"}
     try:
         error = describe_error(config, record, target)
     except TargetError as unusable:

@@ -154,7 +154,7 @@ class Execution:
                     {"command_id": command_id, "setpoints_um": dict(step.setpoints_um)},
                     source=_SERVICE,
                 )
-            self.prompt = f"The robot moves ({step.purpose})."
+            self.prompt = f"The robot is moving ({step.purpose})."
             try:
                 if not self._stands_in_motion_phase(phase):
                     self._link.enter_phase(phase, _SERVICE)
@@ -250,13 +250,13 @@ class Execution:
             if status is None:
                 self.prompt = f"No link to the robot: {self._link.problem}"
             elif status.moving:
-                self.prompt = "The robot is coming to rest."
+                self.prompt = "The robot is coming to a stop."
             elif status.stopped or not status.armed:
                 self._permitted.interrupt()
-                self.prompt = "Re-arm the robot to go on."
+                self.prompt = "Re-arm the robot to continue."
             elif not status.position_certain:
                 self._permitted.interrupt()
-                self.prompt = "The robot was restarted: check it, then re-arm to go on."
+                self.prompt = "The robot was restarted. Check it, then re-arm to continue."
             elif self._permitted.covers(status):
                 return
             else:
@@ -271,7 +271,7 @@ class Execution:
             for axis, to_um in step.setpoints_um.items()
             if status.positions_um.get(axis, to_um) != to_um
         )
-        question = f"The robot was interrupted. Go on ({step.purpose}: {ways or 'no motion'})?"
+        question = f"The robot was interrupted. Continue ({step.purpose}: {ways or 'no motion'})?"
         answer = self._ask(
             AskOperator(question, (GO_ON, ABORT)), f"{command_id}/go-on.{status.stop_count}"
         )
@@ -319,7 +319,7 @@ class Execution:
         margin_s = clock_margin_s(self._config, self._record, now_s)
         wait_s = max(self._config.service.settle_s, margin_s)
         while time.time() < hold.settled_at_s + wait_s:
-            self.prompt = "Standing still before the next slice."
+            self.prompt = "Waiting for the robot to settle before the next slice."
             self._wait()
 
     def _assigned(self, hold: Hold, slice_position_mm: float | None) -> int:
@@ -350,7 +350,7 @@ class Execution:
                 with self._record.transaction():
                     self._record.end_open_hold(time.time())
                     return self._begin_hold(None, dict(status.positions_um), time.time())
-            self.prompt = "The robot's position is not certain: check it, then re-arm to go on."
+            self.prompt = "The robot's position is uncertain. Check it, then re-arm to continue."
             self._wait()
 
     def _measure(self, step: Measure) -> Measured:
@@ -377,10 +377,12 @@ class Execution:
         if here is None or expected is None:
             return
         if other := expected.other_place(here):
-            text = f"the slices are of {other}: the table may have moved. Set the target anew"
+            text = f"the slices are from {other}: the table may have moved. Set the target again"
             raise ProcedureFailedError("other_place", text)
         if other := expected.other_protocol(here):
-            text = f"the slices have {other}: oil appears elsewhere in them. Start anew with these"
+            text = (
+                f"the slices have {other}, so oil appears elsewhere in them. Start again with these"
+            )
             raise ProcedureFailedError("other_protocol", text)
 
     def _scan_frame_before(self, measurement: Measurement) -> ScanFrame | None:
@@ -408,12 +410,12 @@ class Execution:
         for hold in map(self._record.hold, hold_ids):
             known = dict(hold.bridge)
             if not known:
-                return "it is not known how the robot stood at the hold"
+                return "the robot's position at the hold is unknown"
             if hold.ended_at_s is not None:  # it moved on, as commanded, to the next place
                 known["last_motion"] = status.last_motion
             lost = why_stood_no_more(known, status)
             if lost is not None:
-                return f"the slices count no more: {lost.text}"
+                return f"the slices no longer count: {lost.text}"
         return ""
 
     # The operator

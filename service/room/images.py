@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from case_record.record import CaseRecord
+from case_record.seals import TamperedError
 from dicom_slice.pixels import magnitude_pixels
 from dicom_slice.reasons import Reason, UnusableError
 from sr_engine.residual import residual_image
@@ -48,17 +52,29 @@ def slice_file(record: CaseRecord, slice_id: int) -> Path:
     """Return the DICOM file of a slice, bit for bit as it was received."""
     path = record.case_dir / record.slice(slice_id).path
     if not path.is_file():
-        raise ImageMissingError(f"slice {slice_id}: its file is not there any more")
+        raise ImageMissingError(f"slice {slice_id}: its file no longer exists")
     return path
 
 
 def reconstruction_pixels(record: CaseRecord, measurement_id: int) -> NDArray[np.float64]:
     """Return the super-resolution image of a measurement; raises ImageMissingError."""
-    measurement = record.measurement(measurement_id)
-    name = (measurement.result or {}).get("reconstruction")
-    if not name or not (record.case_dir / name).is_file():
+    result = record.measurement(measurement_id).result or {}
+    if (
+        not result.get("reconstruction")
+        or not (record.case_dir / result["reconstruction"]).is_file()
+    ):
         raise ImageMissingError(f"measurement {measurement_id} has no reconstruction")
-    pixels: NDArray[np.float64] = np.load(record.case_dir / name).astype(np.float64)
+    return load_reconstruction(record.case_dir, result)
+
+
+def load_reconstruction(case_dir: Path, result: Mapping[str, Any]) -> NDArray[np.float64]:
+    """The image that the worker made for a result. TamperedError if the file is another one."""
+    path = case_dir / result["reconstruction"]
+    content = path.read_bytes()
+    sworn = result.get("reconstruction_sha256")  # a program before did not say
+    if sworn is not None and hashlib.sha256(content).hexdigest() != sworn:
+        raise TamperedError(f"{path} is not the image that was made")
+    pixels: NDArray[np.float64] = np.load(io.BytesIO(content)).astype(np.float64)
     return pixels
 
 

@@ -13,9 +13,9 @@ def may_start(record: CaseRecord, now: Now) -> ConflictError | None:
     if status is None:
         return ConflictError("no_link", "No link to the robot.")
     if record.running_procedure() is not None:
-        return ConflictError("busy", "A procedure is running: wait for its end or abort it.")
+        return ConflictError("busy", "A procedure is running: wait until it ends, or abort it.")
     if needle_may_be_in(record) or status.insertion_locked:
-        return ConflictError("insertion_locked", "Motion is locked until the needle is out.")
+        return ConflictError("insertion_locked", "Motion is locked until the needle is withdrawn.")
     if status.stopped or not status.armed:
         return ConflictError("not_armed", "Re-arm the robot first.")
     return None

@@ -25,10 +25,12 @@ from case_record.rows import Event, Measurement
 from robot_bridge.client.client import BridgeStatus
 from service.procedure.plan import SAME_PLACE_UM
 from service.procedure.scan_frame import (
+    CASE_REOPENED,
     ScanFrame,
     frame_of,
     other_place_since,
-    other_study_held_since,
+    others_since,
+    seen_seq,
 )
 from service.procedure.targets import current_entry_number, current_target, why_void_target
 from service.room.readiness import ready_arrival
@@ -120,9 +122,10 @@ def why_not_now(record: CaseRecord, measurement: Measurement, now: Now) -> Lost 
         return Lost("record_changed", record.doubt)
     facts = measurement.request.get(RESTS_ON)
     if facts is None:
-        return Lost("unknown", "it is not known what the measurement rests on")
+        return Lost("unknown", "it is unknown what the measurement relies on")
     return (
-        _robot_changed(facts, now)
+        _case_ended(record, measurement)
+        or _robot_changed(facts, now)
         or _scanner_changed(record, measurement)
         or _too_old(facts, now)
         or _measured_again(record, measurement)
@@ -185,7 +188,7 @@ def _why_not_there(
     try:
         measurement = record.measurement(int(arrival.get("measurement_id", 0)))
     except CaseRecordError:
-        return Lost("unknown", "the record does not have the measurement that it rests on")
+        return Lost("unknown", "the measurement it relies on is not in the record")
     arguments = record.procedure(procedure_id).arguments
     return why_not_now(record, measurement, now) or _target_changed(record, arguments)
 
@@ -194,14 +197,22 @@ def _target_changed(record: CaseRecord, approach: Mapping[str, Any]) -> Lost | N
     target = current_target(record)
     if "target" in approach:
         if target is None:
-            return Lost("target_withdrawn", "the target was withdrawn since")
+            return Lost("target_withdrawn", "the target has since been withdrawn")
         if target.number != approach["target"]:
-            return Lost("target_changed", "the target was changed since")
+            return Lost("target_changed", "the target has since been changed")
         if why := why_void_target(record, target):
             return Lost("target_void", why)
     if "entry" in approach and current_entry_number(record) != approach["entry"]:
-        return Lost("target_changed", "the entry point was changed since")
+        return Lost("target_changed", "the entry point has since been changed")
     return None
+
+
+def _case_ended(record: CaseRecord, measurement: Measurement) -> Lost | None:
+    """Also where it was opened again: who has lain on the table in between is not known."""
+    reopened = record.last_event(CASE_REOPENED)
+    if reopened is None or reopened.seq < measurement.requested_seq:
+        return None
+    return Lost("case_ended", "measured before the case was finished and opened again")
 
 
 def why_stood_no_more(facts: Mapping[str, Any], status: BridgeStatus | None) -> Lost | None:
@@ -227,18 +238,18 @@ def _robot_changed(facts: Mapping[str, Any], now: Now) -> Lost | None:
 _MOTIONS = {
     "declared": Lost("declared", "measured before the robot's position was declared"),
     "parked": Lost("parked", "measured before the drives were parked"),
-    "lost": Lost("position", "the robot's position became uncertain since"),
-    "stray": Lost("stray", "an axis has moved without a command since"),
+    "lost": Lost("position", "the robot's position has since become uncertain"),
+    "stray": Lost("stray", "an axis has since moved without a command"),
 }
 
 
 def _moved(facts: Mapping[str, Any], status: BridgeStatus) -> Lost | None:
     if facts["boot_id"] != status.boot_id:
-        return Lost("bridge_restarted", "measured before the robot's bridge was restarted")
+        return Lost("bridge_restarted", "measured before the robot bridge was restarted")
     if status.last_motion != facts["last_motion"]:
         what = status.last_motion.partition(":")[0]
         return _MOTIONS.get(what, Lost("moved", "measured before the last move"))
-    return Lost("moving", "the robot moves") if status.moving else None
+    return Lost("moving", "the robot is moving") if status.moving else None
 
 
 def _stopped(facts: Mapping[str, Any], status: BridgeStatus) -> Lost | None:
@@ -252,9 +263,9 @@ def _stopped(facts: Mapping[str, Any], status: BridgeStatus) -> Lost | None:
 
 def _disturbed(facts: Mapping[str, Any], status: BridgeStatus) -> Lost | None:
     if status.fault is not None:
-        return Lost("fault", f"the motors report a fault ({status.fault})")
+        return Lost("fault", f"motor fault ({status.fault})")
     if not status.position_certain:
-        return Lost("position", "the robot's position is not certain")
+        return Lost("position", "the robot's position is uncertain")
     if facts["parked"] != status.parked:
         done = "parked" if status.parked else "unparked"
         return Lost("parked", f"measured before the drives were {done}")
@@ -265,26 +276,25 @@ def _elsewhere(facts: Mapping[str, Any], status: BridgeStatus) -> Lost | None:
     for axis, at_um in facts["positions_um"].items():
         now_um = status.positions_um.get(axis)
         if now_um is None or not abs(now_um - at_um) <= SAME_PLACE_UM:
-            where = "nowhere known" if now_um is None else f"{now_um / 1000:.3f} mm"
-            text = f"measured with axis {axis} at {at_um / 1000:.3f} mm, now it stands at {where}"
+            where = "an unknown position" if now_um is None else f"{now_um / 1000:.3f} mm"
+            text = f"measured with axis {axis} at {at_um / 1000:.3f} mm; it is now at {where}"
             return Lost("elsewhere", text)
     return None
 
 
 def _scanner_changed(record: CaseRecord, measurement: Measurement) -> Lost | None:
     """Slices that came since, used or not, of another study, frame of reference or protocol."""
-    seen, since = frame_of(record, measurement), measurement.requested_seq
+    seen, since = frame_of(record, measurement), seen_seq(record, measurement)
     if seen is None:
         return None
-    other = other_place_since(record, since, seen)
-    if not other and other_study_held_since(record, since):
-        other = "another study"
-    if other:
-        return Lost("other_place", f"slices of {other} have come since: the table may have moved")
+    if other := other_place_since(record, since, seen) or others_since(record, since):
+        return Lost(
+            "other_place", f"slices from {other} have since arrived: the table may have moved"
+        )
     for came in record.scans_since(since):
         other = seen.other_protocol(ScanFrame.of_header(came))
         if came["state"] == "assigned" and other:
-            return Lost("other_protocol", f"slices with {other} have come since")
+            return Lost("other_protocol", f"slices with {other} have since arrived")
     return None
 
 
@@ -293,7 +303,10 @@ def _too_old(facts: Mapping[str, Any], now: Now) -> Lost | None:
     if age is None:
         return Lost("computer_restarted", "measured before the computer was restarted")
     if not age <= now.valid_s:
-        text = f"measured longer ago than the {now.valid_s:.0f} s that a measurement is good for"
+        text = (
+            f"measured more than {now.valid_s:.0f} s ago, the longest that a measurement "
+            "stays valid"
+        )
         return Lost("expired", text)
     return None
 

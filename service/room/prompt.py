@@ -37,9 +37,9 @@ def _idle_prompt(
             return "Puncture recorded. Withdraw the needle, then unlock motion."
         return "READY: make the puncture."
     if status.phase is WorkPhase.EMERGENCY:
-        return "EMERGENCY: the drives are parked. See to the patient and the needle, then re-arm."
+        return "EMERGENCY: drives parked. Attend to the patient and the needle, then re-arm."
     if not status.position_certain and not status.moving:
-        return f"{in_words(taken_to_stand(status))} Look, and say whether they do."
+        return f"{in_words(taken_to_stand(status))} Check the robot, then confirm them."
     if status.stopped:
         return f"Stopped ({plain_words(status.stop_reason)}). Re-arm to continue."
     if found is not None:
@@ -52,7 +52,7 @@ def _idle_prompt(
     if target is None:
         return "Set a target."
     if why := why_void_target(record, target):
-        return f"Set the target anew: {why}."
+        return f"Set the target again: {why}."
     if config.service.guide is not None and current_entry(record) is None:
         return "Set an entry point."
     return "Start the approach, or set another target."
@@ -61,8 +61,8 @@ def _idle_prompt(
 def _after_arrival(found: Readiness, status: BridgeStatus) -> str:
     """The guide came to its target, but READY cannot be said, or not any more."""
     if found.lost is None:
-        return "Motion is being locked for the needle."
-    first = "Confirm first that the needle is withdrawn. " if status.insertion_locked else ""
+        return "Locking motion for the needle."
+    first = "First confirm that the needle is withdrawn. " if status.insertion_locked else ""
     return f"READY was lost: measure again. {first}({found.lost.text})"
 
 

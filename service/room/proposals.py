@@ -79,7 +79,7 @@ def why_senseless(plan: Plan) -> str:
         if place is not None and not all(math.isfinite(value) for value in place):
             return f"its {name} is not three finite numbers"
     if plan.target_mm is not None and plan.target_mm == plan.entry_mm:
-        return "its entry point is its target: that is no direction"
+        return "its entry point and target are the same point, which gives no direction"
     return ""
 
 
@@ -95,7 +95,7 @@ def why_other_frame(plan_frame: str, room_frame: str) -> str:
     """Why a plan is of another frame of reference; empty where it is not, or nobody can tell."""
     if not plan_frame or not room_frame or plan_frame == room_frame:
         return ""
-    return "it is given in another frame of reference than the slices have"
+    return "it is given in a different frame of reference from the slices"
 
 
 def frame_of_reference(record: CaseRecord) -> str:
@@ -133,7 +133,7 @@ class ProposalBook:
         if event.kind == PROPOSED:
             for number, one in self._known.items():
                 if (one.sender, one.state) == (body["sender"], "open"):
-                    reason = f"proposal {event.event_id} came instead"
+                    reason = f"replaced by proposal {event.event_id}"
                     self._close(number, {"state": "replaced", "reason": reason})
             self._known[event.event_id] = ProposalState(
                 number=event.event_id, at_s=event.wall_s, **body

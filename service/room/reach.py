@@ -30,12 +30,12 @@ def check_reach(room: Room, plan: Plan, *, in_water: bool = False) -> None:
     guide = room.config.service.guide
     calibration = latest_calibration(room.record, guide=guide is not None)
     if calibration is None:
-        raise ReachUnknownError("how far the robot reaches is known after the calibration")
+        raise ReachUnknownError("the robot's reach is not known until it is calibrated")
     status = room.link.status
     if status is None:
-        raise ReachUnknownError("there is no link to the robot")
+        raise ReachUnknownError("no link to the robot")
     if plan.target_mm is None:
-        raise ReachUnknownError("there is no target yet")
+        raise ReachUnknownError("no target set yet")
     start = room.start_point(guide=guide is not None)
     target = Target(0, plan.target_mm, in_water=in_water)
     newest = room.record.last_slice("assigned")
@@ -71,12 +71,12 @@ def entry_of(room: Room, plan: Plan, start: Calibration) -> Point3:
         normal, direction = start.plane.normal, np.array(plan.direction)
         along = float(normal @ direction)
         if not abs(along) > 0.1:
-            raise OutOfReachError("the needle would lie in the slices' plane")
+            raise OutOfReachError("the needle would lie in the slice plane")
         target = np.array(plan.target_mm)
         distance = (guide.lower_plane_mm - float(normal @ target)) / along
         x, y, z = (target + distance * direction).tolist()
         return x, y, z
     entry_mm = current_entry(room.record)
     if entry_mm is None:
-        raise ReachUnknownError("the needle's direction is not known: there is no entry point")
+        raise ReachUnknownError("the needle's direction is not known: no entry point is set")
     return entry_mm

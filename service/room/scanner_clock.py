@@ -10,7 +10,7 @@ from dicom_listener.clock import ClockRules
 from room_config.load import Config
 from service.room.state import ClockState
 
-_WAITS = "slices wait: compare the clocks, or confirm at which hold each was acquired"
+_WAITS = "slices are pending: compare the clocks, or confirm the hold at which each was acquired"
 
 
 def clock_update(config: Config, record: CaseRecord, now_s: float) -> dict[str, Any]:
@@ -24,12 +24,12 @@ def implied(config: Config, compared: ClockState | None, now_s: float) -> str:
     most_s = config.listener.prompt_delay_s
     if compared is None:
         if most_s is None:
-            return f"Not compared, and no delay was measured here: {_WAITS}."
+            return f"Not compared, and no delay has been measured here: {_WAITS}."
         return f"Not compared: slices are judged by the delay measured here, at most {most_s:g} s."
     ends_s = _made_s(compared) + 60 * config.listener.comparison_valid_min
     if now_s < ends_s:
         wait_s = start_margin_s(config, compared, now_s)
-        return f"Used for slices that were acquired {wait_s:.1f} s or more after the robot stood."
+        return f"Used for slices acquired {wait_s:.1f} s or more after the robot settled."
     if most_s is None:
         return f"Too old: {_WAITS}."
     return f"Too old: slices are judged by the delay measured here, at most {most_s:g} s."

@@ -69,12 +69,17 @@ class Trouble:
         self.why, self.abort, self.owed = "", "", []
 
     def refusal(self) -> ConflictError:
-        text = f"The case record cannot be used ({self.why}): nothing is done until it can."
+        text = (
+            f"The case record cannot be used ({self.why}): no command is carried out until it can."
+        )
         return ConflictError("record_unusable", text)
 
     def condition(self) -> Condition:
         text = f"The case record cannot be used: {self.why}"
-        what = "Free or remount the disk of the case. Motion is held; the room goes on by itself."
+        what = (
+            "Free space on the case's disk, or remount it. Motion is blocked; the room then "
+            "continues by itself."
+        )
         return Condition("record_unusable", "alarm", text, what)
 
 

@@ -52,7 +52,7 @@ _STATUS_QUERIES, _POSE_QUERIES = (
 )
 _MOST_POINTS = 256
 _NOT_RIGID = 1e-2
-_OFF = "nothing is taken from peers here but STOP: openigtlink.inwards is off"
+_OFF = "only STOP is accepted from peers here: openigtlink.inwards is off"
 
 
 @dataclass(frozen=True)
@@ -122,7 +122,7 @@ def verdict_of(plan: Plan, verdict: Verdict, state: RoomState) -> tuple[Message,
 def decision_of(number: int, state_word: str, by: str, reason: str, at_s: float) -> Message:
     """What became of a proposal when the operator had seen it."""
     if state_word == "taken":
-        text = f"proposal {number} was taken over by {by}"
+        text = f"proposal {number} was accepted by {by}"
         return status("TARGET", at_s, STATUS_OK, "taken", text)
     who = f" by {by}" if by else ""
     why = f": {reason}" if reason else ""
@@ -160,7 +160,7 @@ def _status_query(state: RoomState) -> Answer:
 def _pose_query(state: RoomState, pose: Callable[[], Pose | None]) -> Answer:
     found = pose()
     if found is None:
-        why = "where the guide is now is not known: it must be measured"
+        why = "the guide's present position is not known: it must be measured"
         said = status("CURRENT_POSITION", state.at_s, STATUS_NOT_READY, "no pose", why)
         return Answer((said,))
     reached = str(int(state.ready))
@@ -200,7 +200,7 @@ def _transform(message: Received, state: RoomState, sender: str) -> Answer:
         )
         return Answer((ack,), plan=plan)
     if message.device.startswith("CLB_"):
-        said = status(about, state.at_s, STATUS_OK, about, "recorded and shown, nothing else")
+        said = status(about, state.at_s, STATUS_OK, about, "recorded and shown only")
         matrix = np.hstack([axes, origin[:, None]]).tolist()
         return Answer((ack, said), registration=matrix)
     return Answer((ack, status_of(state, about)))
@@ -209,7 +209,7 @@ def _transform(message: Received, state: RoomState, sender: str) -> Answer:
 def _points(message: Received, state: RoomState, sender: str) -> Answer:
     found = points_of(message)
     if len(found) > _MOST_POINTS:
-        raise MessageError(f"{len(found)} points are no plan: TARGET and ENTRY are")
+        raise MessageError(f"{len(found)} points are not a plan: send TARGET and ENTRY")
     target, entry = _labelled(found, "TARGET"), _labelled(found, "ENTRY")
     if target is None and entry is None:
         raise MessageError("no point is labelled TARGET or ENTRY")
@@ -241,7 +241,7 @@ def _labelled(found: list[ReceivedPoint], label: str) -> tuple[float, float, flo
 
 # Pieces
 
-_NO_SUCH = "not done from here: STOP, EMERGENCY, queries and proposals are"
+_NO_SUCH = "not available here: only STOP, EMERGENCY, queries and proposals are"
 
 
 def _text_of(message: Received) -> str:
@@ -292,7 +292,7 @@ def _why_no_pose(axes: Array, origin: Array) -> str:
     if not (np.isfinite(axes).all() and np.isfinite(origin).all()):
         return "the matrix has a number that is not finite"
     if not np.allclose(axes.T @ axes, np.eye(3), atol=_NOT_RIGID):
-        return "the matrix is no rotation: its columns are not orthonormal"
+        return "the matrix is not a rotation: its columns are not orthonormal"
     if not np.linalg.det(axes) > 0:
         return "the matrix is left-handed"
     return ""

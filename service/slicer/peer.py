@@ -39,7 +39,7 @@ _PROPOSALS_AT_ONCE, _PROPOSALS_PER_S = 10.0, 1.0
 _STOP_AGAIN_S = 0.1
 _STOPPED_WITHIN_S = 0.7
 _NOT_STOPPED = {
-    "on_its_way": ("on its way", "STOP is on its way: the robot does not stand yet"),
+    "on_its_way": ("on its way", "STOP is on its way: the robot has not stopped yet"),
     "not_delivered": ("not delivered", "NOT DELIVERED: use the stop switch at the robot"),
 }
 _LOOK_S = 0.02
@@ -108,7 +108,7 @@ class Peer:
             ended = await asyncio.gather(*everything, return_exceptions=True)
             for reason in ended:
                 if isinstance(reason, Exception) and not isinstance(reason, OSError):
-                    log.error("peer let go", peer=self.name, exc_info=reason)
+                    log.error("peer disconnected", peer=self.name, exc_info=reason)
 
     def look(self, proposals: list[ProposalState]) -> None:
         """There is a new scene; say what became of this peer's proposals."""
@@ -159,7 +159,7 @@ class Peer:
         number = self.passed_over.total()
         if number >= max(1, 2 * self._logged):
             self._logged = number
-            log.warning("messages passed over", peer=self.name, **self.passed_over)
+            log.warning("messages ignored", peer=self.name, **self.passed_over)
 
     def _stop(self, message: Received, word: str) -> None:
         now_s = time.monotonic()
@@ -208,7 +208,9 @@ class Peer:
     async def _propose(self, plan: Plan) -> None:
         if not self._may_propose():
             self._dropped["proposals"] += 1
-            verdict = Verdict("too_many", "too many proposals: one a second is looked at")
+            verdict = Verdict(
+                "too_many", "too many proposals: at most one per second is considered"
+            )
         else:
             verdict = await self._ask("propose", {"plan": plan})
         if verdict.number is not None:

@@ -163,15 +163,15 @@ def _meta(index: bytes, values: bytes) -> dict[str, str]:
     if not index:
         return {}
     if len(index) < 2:
-        raise MessageError("the meta-data's index is cut off")
+        raise MessageError("the meta-data index is truncated")
     (count,) = struct.unpack_from(">H", index)
     if 2 + count * META_ENTRY.size > len(index):
-        raise MessageError("the meta-data's index is cut off")
+        raise MessageError("the meta-data index is truncated")
     found, at = {}, 0
     for number in range(count):
         name_size, _, value_size = META_ENTRY.unpack_from(index, 2 + number * META_ENTRY.size)
         if at + name_size + value_size > len(values):
-            raise MessageError("the meta-data are cut off")
+            raise MessageError("the meta-data are truncated")
         name = values[at : at + name_size].decode("utf-8", "replace")
         found[name] = values[at + name_size : at + name_size + value_size].decode(
             "utf-8", "replace"
@@ -187,21 +187,21 @@ def string_of(message: Received) -> str:
     _, size = STRING_HEAD.unpack_from(message.content)
     text = message.content[STRING_HEAD.size : STRING_HEAD.size + size]
     if len(text) < size:
-        raise MessageError("a STRING shorter than it says")
+        raise MessageError("a STRING shorter than its stated length")
     return text.decode("utf-8", "replace").strip("\0 \t\r\n")
 
 
 def matrix_of(message: Received) -> tuple[Array, Array]:
     """Axes (3, 3) as columns and origin (3,) of a TRANSFORM, LPS mm; not checked for sense."""
     if len(message.content) != 48:
-        raise MessageError(f"a TRANSFORM has 48 bytes, not {len(message.content)}")
+        raise MessageError(f"a TRANSFORM must have 48 bytes, not {len(message.content)}")
     values = np.frombuffer(message.content, ">f4").astype(float).reshape(4, 3)
     return (values[:3] * TO_RAS).T, values[3] * TO_RAS
 
 
 def points_of(message: Received) -> list[ReceivedPoint]:
     if len(message.content) % POINT_BYTES:
-        raise MessageError(f"a POINT has a multiple of {POINT_BYTES} bytes")
+        raise MessageError(f"a POINT must have a multiple of {POINT_BYTES} bytes")
     found = []
     for at in range(0, len(message.content), POINT_BYTES):
         name, group, *_ = POINT_HEAD.unpack_from(message.content, at)

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from case_record.record import CaseRecord
+from case_record.seals import TamperedError
 from dicom_slice.geometry import SliceGeometry
 from room_config.service import GuideConfig
 from service.room.images import ImageMissingError, reconstruction_pixels, slice_pixels
@@ -97,7 +98,7 @@ def scene_of(state: RoomState, guide: GuideConfig | None = None) -> Scene:
 
 def stale(state: RoomState) -> RoomState:
     """A state that is old: nobody knows what the room does now, and where its guide is."""
-    text = "The control loop does not say what the room is doing."
+    text = "The control loop is not reporting what the room is doing."
     robot = state.robot.model_copy(update={"linked": False, "problem": text, "phase": "STALE"})
     change = {"robot": robot, "ready": False, "procedure": None, "prompt": text}
     return state.model_copy(update=change)
@@ -143,7 +144,7 @@ def _image(
             result = record.measurement(shown.measurement_id).result or {}
             number = int(result["slice_id"])
             pixels = reconstruction_pixels(record, shown.measurement_id)
-    except ImageMissingError:
+    except (ImageMissingError, TamperedError):
         return None
     header = record.slice(number).header
     meta = {IMAGE_STATUS: VALID, **_of_slice(header)}

@@ -181,5 +181,5 @@ class OpenIgtLinkServer:
         if self._networks and not any(address_of(host) in network for network in self._networks):
             return "its address is not in openigtlink.peer_networks"
         if self.receivers >= self._own.max_receivers:
-            return f"{self.receivers} are connected already"
+            return f"{self.receivers} are already connected"
         return ""

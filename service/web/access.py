@@ -92,7 +92,7 @@ class Access:
         identity = self._owner(token, wall_s)
         if identity is None:
             self._failures.setdefault(address, _Failures()).times_s.append(now_s)
-            raise PermissionError("This token is not known here, or it has expired.")
+            raise PermissionError("Unknown or expired token.")
         self._failures.pop(address, None)
         return identity
 
@@ -100,7 +100,7 @@ class Access:
         """As `check_token`, but a STOP with a good token gets through a lock-out."""
         identity = self._owner(token, wall_s)
         if identity is None:
-            raise PermissionError("This token is not known here, or it has expired.")
+            raise PermissionError("Unknown or expired token.")
         return identity
 
     def _owner(self, token: str, wall_s: float) -> Identity | None:

@@ -204,7 +204,7 @@ def _loop_health(loop: ControlLoop) -> str:
     if loop.failure is not None:
         return f"ended: {loop.failure}"
     age_s = loop.state_age_s
-    return "ok" if age_s < STALE_S else f"has said nothing for {age_s:.0f} s"
+    return "ok" if age_s < STALE_S else f"has been silent for {age_s:.0f} s"
 
 
 def _add_page(app: FastAPI) -> None:

@@ -29,7 +29,7 @@ class Documents:
         made, 409 with the command's own words where it cannot be made.
         """
         if not self._busy.acquire(blocking=False):
-            text = "Another report or export is being made: try again in a few seconds."
+            text = "Another report or export is in progress: try again in a few seconds."
             raise ProblemError(429, "busy", text, {"Retry-After": _AGAIN_S})
         folder = Path(tempfile.mkdtemp(prefix="autospine-"))
         try:
@@ -45,7 +45,7 @@ def _written(command: str, case_dir: Path, target: Path) -> Path:
     words = autospine(command, str(case_dir), "--out", str(target))
     failure = run_elsewhere(words, f"The {command}", _PATIENCE_S)
     if failure is None and not target.is_file():
-        failure = "it said nothing"
+        failure = "no output"
     if failure is not None:
         raise ProblemError(409, f"no_{command}", failure.removeprefix(_FAILED))
     return target

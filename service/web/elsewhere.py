@@ -28,8 +28,8 @@ def run_elsewhere(words: Sequence[str], what: str, patience_s: float) -> str | N
             check=False,
         )
     except subprocess.TimeoutExpired:
-        text = f"{what} was not made within {patience_s:.0f} s."
+        text = f"{what} was not finished within {patience_s:.0f} s."
         raise ProblemError(503, "no_answer", text) from None
     if done.returncode == 0:
         return None
-    return (done.stderr.strip().splitlines() or ["it said nothing"])[-1]
+    return (done.stderr.strip().splitlines() or ["no output"])[-1]

@@ -51,7 +51,7 @@ class RoomMetrics(Collector):
         )
         passed_over = GaugeMetricFamily(
             "autospine_openigtlink_passed_over",
-            "Messages of peers that were not heeded.",
+            "Messages from peers that were ignored.",
             labels=["reason"],
         )
         for reason, count in (
@@ -59,6 +59,7 @@ class RoomMetrics(Collector):
         ).items():
             passed_over.add_metric([reason], count)
         yield passed_over
+        yield from self._controllers()
         parts = GaugeMetricFamily(
             "autospine_process_up", "1 while a process of the room works.", labels=["process"]
         )
@@ -82,3 +83,20 @@ class RoomMetrics(Collector):
                 "Smoothed round trip on the line.",
                 value=counters.round_trip_s,
             )
+
+    def _controllers(self) -> Iterator[GaugeMetricFamily]:
+        """What the boards of the axes measure of themselves."""
+        status = self._link.status
+        supply = GaugeMetricFamily(
+            "autospine_motor_supply_volts", "48 V supply at the controller.", labels=["axis"]
+        )
+        board = GaugeMetricFamily(
+            "autospine_motor_board_celsius", "Temperature of the controller.", labels=["axis"]
+        )
+        if status is not None:
+            for axis, millivolts in status.supply_mv.items():
+                supply.add_metric([axis], millivolts / 1000)
+            for axis, celsius in status.board_celsius.items():
+                board.add_metric([axis], celsius)
+        yield supply
+        yield board

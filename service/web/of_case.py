@@ -31,7 +31,7 @@ CaseName = Annotated[
         alias="case",
         min_length=1,
         max_length=255,
-        description="Name of a folder that /api/v1/cases lists; left out: the open case.",
+        description="A folder name as listed by /api/v1/cases; omitted: the open case.",
     ),
 ]
 

@@ -20,7 +20,7 @@ Key = Annotated[
         alias="Idempotency-Key",
         min_length=1,
         max_length=128,
-        description="A command sent again under the same key is not carried out again.",
+        description="A command sent again with the same key is not carried out again.",
     ),
 ]
 REFUSALS = responses(400, 401, 403, 409, 413, 422, 429, 503)

@@ -66,7 +66,7 @@ class OriginRules:
             return None
         return (
             f"Without tokens this service answers to loopback names only, not to {host!r}. "
-            "Behind a proxy, set [service] public_url and let the proxy pass the Host header on."
+            "Behind a proxy, set [service] public_url and let the proxy forward the Host header."
         )
 
     def why_not_origin(self, headers: Headers) -> str | None:
@@ -95,9 +95,9 @@ class OriginRules:
     def _refusal(self, origin: str | None, headers: Headers) -> str:
         own = self.public_url or headers.get("host", "")
         return (
-            f"This order comes from a page at {origin or 'an unknown address'}, but this service "
+            f"This request comes from a page at {origin or 'an unknown address'}, but this service "
             f"is at {own}. If that page is this service behind a proxy, set [service] public_url "
-            "to the address in the browser."
+            "to the address shown in the browser."
         )
 
 

@@ -12,10 +12,10 @@ from service.web.problems import responses
 MOST_ID = 2**53
 Id = Annotated[int, PathParameter(ge=1, le=MOST_ID)]
 After = Annotated[
-    int, Query(ge=0, le=MOST_ID, description="Begin after this id (before it with `newest`).")
+    int, Query(ge=0, le=MOST_ID, description="Start after this id (before it with `newest`).")
 ]
 Limit = Annotated[int, Query(ge=1, le=1000)]
-Newest = Annotated[bool, Query(description="The newest first instead of the oldest first.")]
+Newest = Annotated[bool, Query(description="Newest first instead of oldest first.")]
 ERRORS = responses(401, 404, 409, 422, 429)  # of no such case, of none that is open
 ERRORS_WITH_ID = ERRORS
 

@@ -56,8 +56,8 @@ class Papers:
             Condition(
                 f"papers_{name}",
                 "warning",
-                f"Report or export of case {name} is not there: {why}",
-                "It is tried again. The record itself is complete.",
+                f"Report or export of case {name} is missing: {why}",
+                "Retrying. The record itself is complete.",
             )
             for name, why in list(self._problems.items())
         ]

@@ -20,6 +20,7 @@ from starlette.exceptions import HTTPException
 
 from case_record.cases import CasesError, NoCaseError
 from case_record.record import CaseRecordError, RecordUnavailableError
+from case_record.seals import TamperedError
 from service.room.images import ImageMissingError
 from service.room.readiness import ConflictError
 
@@ -105,6 +106,10 @@ def add_problems(app: FastAPI) -> None:
     async def unknown(_: Request, error: CaseRecordError) -> JSONResponse:
         return problem(404, "not_found", str(error))
 
+    @app.exception_handler(TamperedError)
+    async def changed(_: Request, error: TamperedError) -> JSONResponse:
+        return problem(409, "record_changed", str(error))
+
     @app.exception_handler(RecordUnavailableError)
     @app.exception_handler(sqlite3.OperationalError)
     async def unusable(_: Request, error: Exception) -> JSONResponse:
@@ -117,7 +122,7 @@ def add_problems(app: FastAPI) -> None:
 
     @app.exception_handler(CommandTimeoutError)
     async def late(_: Request, __: CommandTimeoutError) -> JSONResponse:
-        detail = "The control loop did not answer in time; look at the state before trying again."
+        detail = "The control loop did not answer in time; check the state before trying again."
         return problem(503, "no_answer", detail)
 
     @app.exception_handler(RequestValidationError)
@@ -132,7 +137,7 @@ def add_problems(app: FastAPI) -> None:
     @app.exception_handler(Exception)
     async def unexpected(request: Request, error: Exception) -> JSONResponse:
         structlog.get_logger().error("request failed", path=request.url.path, exc_info=error)
-        return problem(500, "internal_error", "The service failed; its log says how.")
+        return problem(500, "internal_error", "Internal error; see the service's log.")
 
 
 def _invalid(error: RequestValidationError) -> JSONResponse:

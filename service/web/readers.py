@@ -83,7 +83,7 @@ class Readers:
 
     async def _answer(self, question: Question) -> Response:
         if self._waiting >= _MOST_WAITING:
-            return _busy("Too many are reading at once")
+            return _busy("Too many requests at once")
         self._waiting += 1
         pool = self._pool = self._pool or _new_pool(self._config)
         try:
@@ -93,7 +93,7 @@ class Readers:
             structlog.get_logger().warning("reading", path=question.path, error=repr(error))
             if self._pool is pool:
                 self.close()
-            return _busy("This could not be read in time")
+            return _busy("Reading took too long")
         finally:
             self._waiting -= 1
         response = Response(made.body, made.status)

@@ -71,7 +71,7 @@ class Gate:
                 async with asyncio.timeout(_BODY_PATIENCE_S):
                     receive = await _bounded(Headers(scope=scope), receive)
         except TimeoutError:
-            text = f"The body did not come within {_BODY_PATIENCE_S:.0f} s."
+            text = f"The body did not arrive within {_BODY_PATIENCE_S:.0f} s."
             await problem(408, "slow_body", text)(scope, receive, send)
             return
         except ProblemError as error:
@@ -114,7 +114,9 @@ class Gate:
         if method in _SAFE or path == STOP_PATH:
             return
         if identity.uses_cookie and headers.get("x-csrf-token") != identity.csrf:
-            raise ProblemError(403, "csrf", "The X-CSRF-Token is missing or old: load the page.")
+            raise ProblemError(
+                403, "csrf", "The X-CSRF-Token is missing or out of date: reload the page."
+            )
         if identity.role != "operator" and path != SESSION_PATH:
             detail = f"{identity.name} is a viewer: viewers may look and press STOP only."
             raise ProblemError(403, "wrong_role", detail)
@@ -218,7 +220,7 @@ async def _bounded(headers: Headers, receive: Receive) -> Receive:
 
 
 def too_large() -> ProblemError:
-    return ProblemError(413, "too_large", f"A body has at most {_MOST_BODY_BYTES} bytes.")
+    return ProblemError(413, "too_large", f"A body may have at most {_MOST_BODY_BYTES} bytes.")
 
 
 def _once_more(message: Message) -> Receive:

@@ -8,7 +8,10 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from service.room.summaries import PointMm
 
-_WHO = "Who asks; recorded with the event. Where tokens are used the token's name is recorded."
+_WHO = (
+    "Who asks; recorded with the event. Where tokens are used, the token's name is recorded "
+    "instead."
+)
 
 
 class _Body(BaseModel):
@@ -23,8 +26,8 @@ class ResetBody(Ask):
     positions_um: dict[str, int] | None = Field(
         default=None,
         max_length=32,
-        description="Where the axes stand whose position is not certain, as somebody has seen: "
-        "what the state shows as robot.taken_um, or better.",
+        description="Positions of the axes whose position is uncertain, as someone has checked: "
+        "as shown in robot.taken_um, or better.",
         examples=[{"xt": 5000, "yt": -3000}],
     )
 
@@ -57,7 +60,7 @@ class TargetBody(PointBody):
     label: str = Field(default="", max_length=80)
     in_water: bool = Field(
         default=False,
-        description="A place in tissue: the oil-water shift of the slices is allowed for.",
+        description="True: a point in tissue; the oil-water shift of the slices is corrected for.",
     )
 
 
@@ -78,7 +81,7 @@ class TakeBody(Ask):
     """Take a proposal over; what only the operator can say must be said."""
 
     in_water: bool = Field(
-        description="True: the target is a place in tissue; false: where the fiducial is to be."
+        description="True: the target is a point in tissue; false: where the fiducial is to be."
     )
     label: str = Field(default="", max_length=80)
 
@@ -91,7 +94,7 @@ class AnswerBody(Ask):
     plan_id: str | None = Field(
         default=None,
         max_length=200,
-        description="The plan that is confirmed; refused if it is not the one that is asked about.",
+        description="The plan being confirmed; refused if it is not the one in question.",
     )
 
 
@@ -137,7 +140,7 @@ class StudyBody(Ask):
         min_length=1,
         max_length=64,
         pattern=r"^[0-9.]+$",
-        description="StudyInstanceUID of slices that /api/v1/holding lists.",
+        description="StudyInstanceUID of slices listed by /api/v1/holding.",
         examples=["1.2.826.0.1.3680043.8.498.1"],
     )
 
@@ -217,7 +220,7 @@ class SliceBody(BaseModel):
     geometry: dict[str, Any] | None
     offered_hold_id: int | None = Field(
         default=None,
-        description="The hold for which a person may say that this slice is of it.",
+        description="The hold to which a person may assign this slice.",
     )
 
 

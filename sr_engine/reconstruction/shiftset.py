@@ -82,7 +82,7 @@ NAMED: MappingProxyType[str, ShiftSet] = MappingProxyType(
 def named(name: str) -> ShiftSet:
     """One of ``NAMED``. Raises ParameterError with the known names."""
     if name not in NAMED:
-        raise ParameterError(f"no shift set is called {name!r}; known: {', '.join(NAMED)}, paper")
+        raise ParameterError(f"unknown shift set {name!r}; known: {', '.join(NAMED)}, paper")
     return NAMED[name]
 
 
@@ -142,6 +142,6 @@ def require_regular(
         )
     raise SingularShiftSetError(
         f"the {len(shifts)} shifts are singular for factor {factor} (condition number "
-        f"{condition:.3g}, limit {max_condition_number:.3g}): modulo one pixel they do not tell "
-        f"the aliases apart, as when all lie on one line"
+        f"{condition:.3g}, limit {max_condition_number:.3g}): modulo one pixel they do not "
+        "separate the aliases, as when all lie on one line"
     )

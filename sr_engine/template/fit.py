@@ -187,19 +187,19 @@ def _settled(values: Array, image: ObjectImage, metric: Metric, start: Array) ->
         try:
             inverse = np.linalg.inv(system)
         except np.linalg.LinAlgError:
-            raise NotConvergedError("no contrast is left of the template") from None
+            raise NotConvergedError("the template has no contrast left") from None
         step = inverse @ (weighed.T @ residual - precision * parameters)
         longest = float(np.max(np.abs(step[:2])))
         if not np.all(np.isfinite(step)):
-            raise NotConvergedError("no contrast is left of the template")
+            raise NotConvergedError("the template has no contrast left")
         step = step * min(1.0, _LONGEST_STEP_PX / max(longest, 1e-12))
         parameters = parameters + step
         if not np.all(np.abs(parameters[:2]) < 4.0):
-            raise NotConvergedError("the fit of the template ran away from its start")
+            raise NotConvergedError("the template fit diverged from its start")
         if longest < _SETTLED_SIGMA * float(np.sqrt(inverse[0, 0])):
             break
     else:
-        raise NotConvergedError(f"the fit of the template did not settle in {_ITERATIONS} steps")
+        raise NotConvergedError(f"the template fit did not converge in {_ITERATIONS} steps")
     pull = inverse @ (precision * parameters)
     gain = (weighed @ inverse.T) * (np.sqrt(variance) * weight)[:, None]
     spread = gain if metric.correlation is None else metric.correlation @ gain
@@ -213,8 +213,8 @@ def _summary(fit: _Settled, whole: Array, metric: Metric) -> TemplateFit:
     amplitude = float(fit.parameters[_AMPLITUDE])
     if not (chi2 < _GROSS and amplitude > 0):
         raise TemplateMismatchError(
-            f"what is at row {whole[0]:.0f}, col {whole[1]:.0f} is not the template's object "
-            f"(chi2 {chi2:.1f} a pixel, amplitude {amplitude:.2f} of the template's)"
+            f"the object at row {whole[0]:.0f}, col {whole[1]:.0f} is not the template's object "
+            f"(chi2 {chi2:.1f} per pixel, amplitude {amplitude:.2f} of the template's)"
         )
     grown = metric.widened * max(1.0, chi2 if chi2 > 1 + 4 * np.sqrt(2 / n) else 1.0)
     noise = metric.sigma if metric.kind == "rician" else float(np.sqrt(metric.variances[-1]))

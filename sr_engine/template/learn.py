@@ -103,8 +103,8 @@ def learn_template(
     shifts = checked_shifts(shifts_px, len(stack))
     if len(stack) < LEAST_FRAMES:
         raise TemplateError(
-            f"a template needs at least {LEAST_FRAMES} frames at known displacements, "
-            f"there are {len(stack)}"
+            f"a template needs at least {LEAST_FRAMES} frames at known displacements, got "
+            f"{len(stack)}"
         )
     near = None if centre_px is None else np.asarray(centre_px, float)
     found = moving_object(stack, shifts, radius_px, near)
@@ -195,8 +195,7 @@ def _learnt(stack: Array, found: Moving, shifts: Array, kind: NoiseKind) -> _Lea
         amplitudes = np.array([fit.amplitude for fit in fits])
         if not np.all(amplitudes > 0.05 * np.median(amplitudes)) or amplitudes.mean() <= 0:
             raise TemplateError(
-                "no common image: what is in the frames at the given displacements is not one "
-                "object"
+                "no common image: the frames do not show one object at the given displacements"
             )
         mean = float(amplitudes.mean())
         image = replace(image, spectrum=image.spectrum * mean)
@@ -282,7 +281,7 @@ def _checked(
         except EngineError as error:
             errors.append(error)
     if not ways:
-        raise TemplateError(f"the frames are not of one object: {errors[0]}")
+        raise TemplateError(f"the frames do not show one object: {errors[0]}")
     best = min(ways, key=lambda way: way.variance_px2)
     _refuse_scattered(best)
     metric = replace(best.metric, widened=best.widened)
@@ -338,7 +337,7 @@ def _placed(
     for number, (frame, shift) in enumerate(zip(stack, shifts, strict=True)):
         fit = fit_image(frame, image, metric, found.centre_px + shift)
         if not fit.significance > _LEAST_SIGNIFICANCE:
-            raise TemplateError(f"frame {number} does not show the object that the others show")
+            raise TemplateError(f"frame {number} does not show the same object as the others")
         fits.append(fit)
     apart = np.array([fit.centre_px for fit in fits]) - shifts - found.centre_px
     apart = apart - apart.mean(axis=0)
@@ -355,7 +354,7 @@ def _refuse_scattered(placed: _Placed) -> None:
         worst = int(np.argmax(placed.squares))
         row, col = placed.apart_px[worst]
         raise TemplateError(
-            f"the frames disagree with their displacements (chi2 {scatter:.0f} a degree of "
-            f"freedom), most of all frame {worst}, by row {row:+.3f} col {col:+.3f} px: wrong "
-            f"displacements, or the object moved otherwise"
+            f"the frames disagree with their displacements (chi2 {scatter:.0f} per degree of "
+            f"freedom), worst in frame {worst}, by row {row:+.3f} col {col:+.3f} px: the "
+            "displacements are wrong, or the object moved differently"
         )

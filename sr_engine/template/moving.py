@@ -46,8 +46,8 @@ def moving_object(
     spread = float(np.sqrt(np.mean(np.sum((shifts_px - shifts_px.mean(axis=0)) ** 2, axis=1))))
     if near_px is None and not spread > LEAST_SPREAD_PX:
         raise TemplateError(
-            f"the displacements differ by {spread:.2f} px only: what moves cannot be told from "
-            f"what stands still"
+            f"the displacements differ by only {spread:.2f} px: the moving object cannot be told "
+            "from the static background"
         )
     back = np.array([_moved(f, -d) for f, d in zip(frames, shifts_px, strict=True)])
     together = np.median(back, axis=0) if len(back) > 4 else back.mean(axis=0)
@@ -94,7 +94,7 @@ def _outlined(image: Array, peak: NDArray[np.int_], radii: tuple[float, float]) 
     sign = np.sign(contrast[near][int(np.argmax(np.abs(contrast[near])))])
     inside = sign * contrast > _OUTLINE * float(np.percentile(sign * contrast[near], 95))
     if strongest == 0 or not inside.any():
-        raise TemplateError("what moves in the frames has no contrast")
+        raise TemplateError("the moving object has no contrast")
     pieces, _ = label(inside, structure=np.ones((3, 3)))
     closest = int(np.argmin(np.where(inside, distance, np.inf)))
     whole = binary_fill_holes(pieces == pieces.flat[closest])
@@ -102,7 +102,7 @@ def _outlined(image: Array, peak: NDArray[np.int_], radii: tuple[float, float]) 
     radius = float(np.sqrt(row.size / np.pi))
     if not 0.7 * radii[0] <= radius <= 1.4 * radii[1]:
         raise TemplateError(
-            f"what moves, at row {peak[0]}, col {peak[1]}, is as large as a disc of radius "
+            f"the moving object, at row {peak[0]}, col {peak[1]}, is as large as a disc of radius "
             f"{radius:.1f} px; {radii[0]:.1f} to {radii[1]:.1f} px are looked for"
         )
     return Moving(np.array([row.mean() + r0, col.mean() + c0]), radius)

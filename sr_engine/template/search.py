@@ -52,13 +52,13 @@ def find_object(
     best, second = (float(peaks.flat[i]) for i in order)
     if not best > LEAST_LIKENESS:
         raise NoRoundObjectError(
-            f"nothing in the frame is like the template (likeness {best:.2f}, least "
+            f"nothing in the frame resembles the template (likeness {best:.2f}, least "
             f"{LEAST_LIKENESS:g})"
         )
     if second > _AMBIGUOUS * best:
         (row, col), (row2, col2) = places
         raise AmbiguousObjectError(
-            f"two things are like the template, at row {row:.0f} col {col:.0f} and at row "
+            f"two objects resemble the template, at row {row:.0f} col {col:.0f} and at row "
             f"{row2:.0f} col {col2:.0f}: say where to look"
         )
     return places[0]

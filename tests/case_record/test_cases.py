@@ -58,7 +58,7 @@ def test_old_cases_are_found_by_name_and_no_path_gets_through(tmp_path):
 @pytest.mark.parametrize("word", ["../elsewhere\n", "..\n", "/etc\n"])
 def test_a_word_that_is_no_folders_name_opens_nothing(tmp_path, word):
     (tmp_path / OPEN_FILE).write_text(word)
-    with pytest.raises(CasesError, match="not a folder's name"):
+    with pytest.raises(CasesError, match="not a folder name"):
         _ = Cases(tmp_path).open
 
 
@@ -71,5 +71,5 @@ def test_what_a_crash_leaves_half_written_is_not_read(tmp_path):
 
 def test_a_folder_that_cannot_be_written_is_named(tmp_path):
     (tmp_path / "file").write_text("not a folder")
-    with pytest.raises(CasesError, match=r"file.*cannot be made"):
+    with pytest.raises(CasesError, match=r"file.*cannot be created"):
         Cases(tmp_path / "file").make_folder()

@@ -297,7 +297,7 @@ def test_slices_that_were_held_up_do_not_agree_and_are_not_believed():
         clock = after(clock, slice_, rules=MEASURED)
     unknown = clock.bounds_for(slice_, MEASURED)
     assert isinstance(unknown, OffsetUnknown)
-    assert "no 5 slices came as promptly as was measured at this site" in unknown.text
+    assert "no 5 slices arrived as promptly as was measured at this site" in unknown.text
 
 
 def test_with_comparison_and_promptness_an_acquisition_must_be_good_by_both():
@@ -307,7 +307,7 @@ def test_with_comparison_and_promptness_an_acquisition_must_be_good_by_both():
     assert bounds.low_s == pytest.approx(0.5 - 3.0)
     held_up = Received(acquired(1010.0), 1012.0 + 50.0)
     seen = observe(clock, held_up, MEASURED)
-    assert "no slice came later than 3.0 s when this was measured" in seen.unlike
+    assert "no slice arrived later than 3.0 s when this was measured" in seen.unlike
     assert seen.clock.bounds_for(held_up, MEASURED).low_s == pytest.approx(-0.1, abs=0.1)
 
 

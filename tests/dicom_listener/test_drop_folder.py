@@ -95,7 +95,7 @@ def test_a_file_that_stays_unfinished_is_one_alarm_and_taken_if_it_is_finished_a
     time.sleep(0.15)
     watching.look(3)
     assert watching.kinds == ["watch_dir_refused"]
-    assert "not whole for" in watching.drop_folder.alarms[0][1]
+    assert "incomplete for" in watching.drop_folder.alarms[0][1]
     path.write_bytes(raw)
     watching.look()
     assert len(watching.stored) == 1

@@ -94,7 +94,7 @@ def test_what_was_left_out_of_a_request_stands_in_its_report(tmp_path):
     ("request_pdu", "text"),
     [
         (associate(contexts=context(2)), "no presentation context can be used: presentation con"),
-        (associate(contexts=b""), "no presentation context can be used: it proposes none"),
+        (associate(contexts=b""), "no presentation context can be used: none were proposed"),
         (associate(user=item(0x52, b"1.2")[:-1]), "is cut off"),
         (struct.pack(">BBL", 1, 0, 10) + bytes(10), "an association request of 16 bytes"),
     ],
@@ -117,9 +117,9 @@ def test_a_request_that_cannot_be_read_is_aborted_at_once_with_a_line(tmp_path, 
     ("how", "kind", "text"),
     [
         ("abort", "aborted", "aborted by the sender"),
-        ("reset", "broken", "the connection broke (Connection reset by peer)"),
+        ("reset", "broken", "the connection was broken (Connection reset by peer)"),
         ("close", "closed", "the sender closed the connection without a release"),
-        ("stall", "idle", "nothing came for 0.5 s"),
+        ("stall", "idle", "nothing arrived for 0.5 s"),
     ],
 )
 def test_a_transfer_that_breaks_off_in_mid_slice_leaves_a_line_and_no_file(

@@ -78,7 +78,7 @@ BOMBS = [
     (implicit_item_bomb(), IMPLICIT, "items"),
     (deep_bomb(), "1.2.840.10008.1.2.1", "deep"),
     (element_bomb(), "1.2.840.10008.1.2.1", "elements"),
-    (long_header(), "1.2.840.10008.1.2.1", "MiB beside the pixels"),
+    (long_header(), "1.2.840.10008.1.2.1", "MiB besides the pixels"),
 ]
 
 

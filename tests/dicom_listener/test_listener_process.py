@@ -193,7 +193,7 @@ def test_a_slice_of_before_the_hold_that_is_pushed_late_waits_for_the_clocks_to_
         send(listener.port, mr_data_set("1.2.1", began_s=settled_s - 6.0))
         (row,) = rows(record, 1)
         assert (row.state, row.reason_code) == ("pending", "clock_unknown")
-        assert "compare the clocks, or confirm at which hold" in row.reason
+        assert "compare the clocks, or confirm the hold at which" in row.reason
         good = mr_data_set("1.2.2", began_s=settled_s + 2.0)
         good.AcquisitionNumber = 2
         send(listener.port, good)

@@ -157,7 +157,7 @@ def test_nothing_of_another_patient_gets_in_before_the_case_is_bound_either(room
     room.send("berta", ImageOrientationPatient=[1, 0, 0, 0, 1, 0])  # axial: never used
     assert states(record) == []
     assert room.why_held() == ["no_slice_used_yet"]
-    assert "no slice of this case was used yet" in room.held.all()[0].reason
+    assert "no slice of this case has been used yet" in room.held.all()[0].reason
     room.send("anna", ImageOrientationPatient=[1, 0, 0, 0, 1, 0])
     room.send("anna")
     # what waited of her comes after, what waited of the other one stays where it is
@@ -176,6 +176,9 @@ def test_five_patients_in_a_row_with_late_slices_of_the_one_before(room):
             assert room.why_held()[-1] == "other_case"
         for _ in range(3):
             room.send(name)
+        if number:
+            room.send(names[number - 1])
+            assert records[-1].last_event("slice_held").body["same_patient"] is False
         room.finish()
         room.send(name)
         assert room.why_held()[-1] == "no_case_open"
@@ -184,6 +187,17 @@ def test_five_patients_in_a_row_with_late_slices_of_the_one_before(room):
         record.verify_events()
         assert says(record.case_dir, name)
         assert [other for other in names if other != name and says(record.case_dir, other)] == []
+
+
+def test_an_earlier_study_of_the_same_patient_is_said_to_be_of_the_same(room):
+    room.begin()
+    room.send("anna")
+    room.finish()
+    record = room.begin()
+    room.send("anna", StudyInstanceUID="1.2.826.1.2")
+    room.send("anna")
+    assert room.why_held()[-1] == "other_case"
+    assert record.last_event("slice_held").body["same_patient"] is True
 
 
 def test_two_patients_whose_slices_come_interleaved(room):
@@ -229,9 +243,9 @@ def test_the_study_of_another_patient_is_never_taken_in(room):
     room.send("anna")
     room.send("berta")
     (study,) = room.held.studies()
-    with pytest.raises(TakingError, match="another patient"):
+    with pytest.raises(TakingError, match="a different patient"):
         take_study(record, room.cases.home, study.study, "Olga")
-    with pytest.raises(TakingError, match="nothing of the study"):
+    with pytest.raises(TakingError, match="no slices of study"):
         take_study(record, room.cases.home, "1.2.3.4", "Olga")
 
 

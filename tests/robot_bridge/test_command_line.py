@@ -1,4 +1,4 @@
-"""The engineer's commands as processes, to a running daemon and straight at the controllers."""
+"""The engineer's commands as processes, to a running daemon and directly to the controllers."""
 
 import contextlib
 import io
@@ -132,7 +132,7 @@ def test_direct_commands_are_refused_while_the_daemon_runs(shared_room: BridgeRo
     for arguments in (["status"], ["--yes", "calibrate-steps", "xt"]):
         ended = robot(room, *arguments, link=False)
         assert ended.returncode == 3
-        assert "another bridge is running" in ended.stderr
+        assert "another bridge is using it" in ended.stderr
         assert "Traceback" not in ended.stderr
 
 
@@ -162,7 +162,7 @@ def test_without_a_bridge_the_error_is_one_line_and_exit_3(tmp_path: Path):
     with bridge_room(tmp_path) as room:
         ended = robot(room, "--timeout", "1", "status")
         assert ended.returncode == 3
-        assert "no bridge answers" in ended.stderr
+        assert "no answer from a bridge" in ended.stderr
         assert ended.stderr.count("\n") == 1
 
 

@@ -249,7 +249,7 @@ def test_a_second_daemon_on_the_same_state_is_refused(shared_room: BridgeRoom):
     room.ready_client()
     second = room.start_daemon()
     assert second.wait(10) == 3
-    assert "another bridge is running" in room.log
+    assert "another bridge is using it" in room.log
     assert "Traceback" not in room.log
 
 

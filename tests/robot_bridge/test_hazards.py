@@ -19,7 +19,6 @@ from robot_bridge.protocol import framing
 from robot_bridge.protocol.framing import Deframer, Frame, FrameCounters, StopAckFrame
 from robot_bridge.protocol.messages import (
     PROTOCOL_VERSION,
-    SCHEMA,
     Answer,
     Arm,
     DeclarePosition,
@@ -32,9 +31,8 @@ from robot_bridge.protocol.messages import (
     Rearm,
     SetPhase,
     Status,
-    pack,
-    unpack,
 )
+from robot_bridge.protocol.packing import SCHEMA, pack, unpack
 from robot_bridge.protocol.phases import WorkPhase
 from robot_bridge.protocol.transport import SerialTransport
 from simulator.serial_line import LineFaults

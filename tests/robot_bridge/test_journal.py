@@ -78,7 +78,7 @@ def test_damage_in_the_middle_is_an_error_that_names_file_and_line(tmp_path: Pat
 
 def test_two_bridges_cannot_share_a_journal(tmp_path: Path):
     first = Journal(tmp_path)
-    with pytest.raises(JournalError, match="another bridge is running"):
+    with pytest.raises(JournalError, match="another bridge is using it"):
         Journal(tmp_path)
     first.close()
     Journal(tmp_path).close()

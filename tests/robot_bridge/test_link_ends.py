@@ -14,13 +14,12 @@ from robot_bridge.protocol.bridge_end import (
 from robot_bridge.protocol.framing import Deframer, Frame, FrameCounters
 from robot_bridge.protocol.messages import (
     PROTOCOL_VERSION,
-    SCHEMA,
     Answer,
     Disarm,
     Hello,
     HelloRequest,
-    pack,
 )
+from robot_bridge.protocol.packing import SCHEMA, pack
 from robot_bridge.protocol.service_end import TRIES_MAX, Answered, GaveUp, ServiceEnd, SessionLost
 
 

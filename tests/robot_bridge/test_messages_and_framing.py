@@ -26,12 +26,9 @@ from robot_bridge.protocol.framing import (
 from robot_bridge.protocol.messages import (
     MESSAGES,
     AxisTravel,
-    MessageError,
     Move,
-    pack,
-    schema_text,
-    unpack,
 )
+from robot_bridge.protocol.packing import MessageError, pack, schema_text, unpack
 
 TEXT = st.text(max_size=60)
 INTEGER = st.integers(-(2**53), 2**53)

@@ -8,11 +8,11 @@ beyond its travel, and what is called certain is where it is said to be.
 import os
 import random
 from collections import Counter
-from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
 from pmd_rig import StageWithEnds, axis_config
+from virtual_ports import Line, Plug
 
 from robot_bridge.daemon.bridge import Bridge
 from robot_bridge.daemon.bridge_settings import BridgeSettings
@@ -34,6 +34,7 @@ from robot_bridge.protocol.messages import (
     Move,
     Rearm,
     SetPhase,
+    Status,
 )
 
 TRAVEL_UM = 20_000
@@ -65,59 +66,11 @@ class ScatteringStage(StageWithEnds):
         super().drive(microsteps, frequency_hz)
 
 
-class Plug:
-    """One adapter: a port with a bus behind it, which can be pulled out and put in elsewhere."""
-
-    def __init__(self, line: "Line", bus: EmulatedBus) -> None:
-        self.line, self.bus, self.out = line, bus, False
-
-    def read(self, size: int = 1, /) -> bytes:
-        self._must_be_in()
-        heard = self.bus.take_output(self.line.now_s)
-        if not heard:
-            self.line.wait(0.002)
-            heard = self.bus.take_output(self.line.now_s)
-        return heard
-
-    def write(self, data: bytes, /) -> int:
-        self._must_be_in()
-        self.bus.receive(data, self.line.now_s)
-        return len(data)
-
-    def reset_input_buffer(self) -> None:
-        self._must_be_in()
-        self.bus.take_output(self.line.now_s)
-
-    def close(self) -> None:
-        pass
-
-    def _must_be_in(self) -> None:
-        if self.out:
-            raise OSError("the adapter is gone")
-
-
-@dataclass
-class Line:
-    """All adapters and the time."""
-
-    now_s: float = 1000.0
-    plugs: dict[str, Plug] = field(default_factory=dict)
-
-    def wait(self, seconds: float) -> None:
-        self.now_s += seconds
-        for plug in self.plugs.values():
-            plug.bus.advance(self.now_s)
-
-    def open_port(self, url: str) -> Plug:
-        if self.plugs[url].out:
-            raise OSError("no such device")
-        return self.plugs[url]
-
-
 class Campaign:
     """One robot with what may be wrong with it, and everything that is asked of it."""
 
     def __init__(self, folder: Path, seed: int) -> None:
+        self.seed = seed
         self.rng = rng = random.Random(seed)
         self.line = Line()
         self.count = rng.choice((1, 2, 4))
@@ -247,11 +200,22 @@ class Campaign:
             bound_um = status.bound_um.get(name, 0) + TOLERANCE_UM + 5
             off_um = self.truth_um()[name] - self.offset_um[name] - told_um
             assert abs(off_um) <= bound_um, f"{name}: certain, and {off_um:+.0f} um off, {self}"
+        if self.drive == "open_loop":
+            self.check_remembered(status)
+
+    def check_remembered(self, status: Status) -> None:
+        """Where an axis is taken for, that is not certain, is true within its bound as well."""
+        for name, taken_um in status.remembered_um.items():
+            off_um = self.truth_um()[name] - self.offset_um[name] - taken_um
+            bound_um = status.bound_um[name] + TOLERANCE_UM
+            assert abs(off_um) <= bound_um, (
+                f"{name}: taken for {taken_um} +- {bound_um} um, and {off_um:+.0f} um off, {self}"
+            )
 
     def __str__(self) -> str:
         return (
-            f"{self.count} axes, {self.drive}, own ports {self.own_ports}, latency "
-            f"{self.latency_s}, {[b.motor for b in self.boards]}, tally {dict(self.tally)}"
+            f"seed {self.seed}, {self.count} axes, {self.drive}, own ports {self.own_ports}, "
+            f"latency {self.latency_s}, {[b.motor for b in self.boards]}, tally {dict(self.tally)}"
         )
 
     # --- what happens -------------------------------------------------------------------------
@@ -367,8 +331,19 @@ class Campaign:
         one.bus, two.bus = two.bus, one.bus
         one.out = two.out = False
 
+    def mend(self) -> None:
+        """An engineer has read why nothing gets anywhere, and rewires what is wrong."""
+        self.run(0.3)
+        for board in self.boards:
+            serial_number, ends = board.motor.serial_number, board.motor.switches_um
+            board.motor = Motor(serial_number=serial_number, switches_um=ends)
+            board.power_on(self.line.now_s)
+        self.tally["mended"] += 1
+
     def step(self) -> None:
         self.check_certain()
+        if not self.bridge.moving and self.rng.random() < 0.04:
+            self.mend()
         if self.rng.random() < 0.06:
             self.disturb()
         if not self.make_ready():
@@ -405,6 +380,7 @@ def test_a_short_campaign(tmp_path: Path):
 
 @pytest.mark.soak
 def test_twenty_thousand_moves(tmp_path: Path):
-    total = run_campaign(tmp_path, int(os.environ.get("MOVES", "20000")), 1000)
+    first_seed = int(os.environ.get("SEED", "1000"))
+    total = run_campaign(tmp_path, int(os.environ.get("MOVES", "20000")), first_seed)
     print(dict(total))
-    assert total["move DONE"] > 0.4 * total["moves"], total
+    assert total["move DONE"] > 0.6 * total["moves"], total

@@ -170,9 +170,9 @@ def test_an_encoder_that_does_not_follow_is_called_stalled(fault: str):
 @pytest.mark.parametrize(
     ("wrong", "told"),
     [
-        ({"encoder_reversed": True}, "the encoder -200 um"),
-        ({"um_per_count": 0.05}, "the encoder +400 um"),
-        ({"um_per_count": 0.2}, "the encoder +100 um"),
+        ({"encoder_reversed": True}, "-200 um by the encoder"),
+        ({"um_per_count": 0.05}, "+400 um by the encoder"),
+        ({"um_per_count": 0.2}, "+100 um by the encoder"),
     ],
 )
 def test_an_encoder_that_disagrees_with_the_motor_is_found_in_a_short_run(wrong: dict, told: str):
@@ -249,7 +249,7 @@ def test_one_wrong_bit_that_makes_a_motion_of_a_status_question_is_stopped_at_on
         made.bus._with_wrong_bit = lambda line: line.replace(b"U0", b"T0")
         wait_until(motors, lambda s: not motors._other)
         with made.lock:
-            made.bus.faults.garble_commands = 1
+            made.bus.faults.garble_commands = 3  # both positions are asked first
         status = wait_until(motors, lambda s: s.fault is not None)
         made.bus._with_wrong_bit = real
         assert "damaged on the line" in status.fault_text
@@ -431,7 +431,7 @@ def test_a_port_that_takes_no_bytes_is_an_error_within_its_bound():
     tty.setraw(writer)
     port = SerialPort(os.ttyname(writer), 115200)
     begun_s = time.monotonic()
-    with pytest.raises(OSError, match="takes no more bytes"):
+    with pytest.raises(OSError, match="accepts no more bytes"):
         port.write(b"X" * 200_000)
     assert time.monotonic() - begun_s < 10.0  # its bound is far below; without one it hangs
     port.close()
@@ -480,7 +480,7 @@ def test_two_boards_that_come_back_under_each_others_names_move_nothing(tmp_path
         plug(x, "two")
         motors._lose_port("both unplugged")
         status = wait_until(motors, lambda s: s.fault == "wrong_board")
-        assert "have changed places" in status.fault_text
+        assert "were swapped" in status.fault_text
         assert {"3010001", "3010002"} <= set(re.findall(r"board (\d+)", status.fault_text))
         for _ in range(3):
             with pytest.raises(MotorError):

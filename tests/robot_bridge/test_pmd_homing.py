@@ -75,7 +75,7 @@ def refused(motors, why: str) -> None:
 def test_an_axis_with_neither_encoder_nor_switch_is_declared_and_not_homed():
     with rig(stage=StageWithEnds) as made, opened(made, declare=False) as motors:
         motors.home(["xt"])
-        refused(motors, "neither an encoder nor a limit switch")
+        refused(motors, "no encoder or limit switch")
         assert made.position_um(1) == 0
 
 
@@ -99,7 +99,7 @@ def test_a_switch_that_sticks_on_the_way_is_no_reference():
         wait_until(motors, lambda s: made.position_um(1) < -500)
         with made.lock:
             made.controller(1).faults.limit_reverse = True
-        refused(motors, "does not go off when the axis leaves it")
+        refused(motors, "stays on when the axis leaves it")
 
 
 def test_switches_that_are_wired_the_wrong_way_round_are_no_reference():

@@ -80,7 +80,7 @@ def test_a_line_that_cannot_be_opened_is_named(url: str):
     with pytest.raises(TransportError, match="cannot be opened") as caught:
         SerialTransport(url, 115200)
     assert url in str(caught.value)
-    with pytest.raises(LinkLostError, match="no bridge answers"):
+    with pytest.raises(LinkLostError, match="no answer from a bridge"):
         BridgeClient(url).open(0.1)
 
 

@@ -29,13 +29,13 @@ from robot_bridge.protocol.bridge_end import (
 )
 from robot_bridge.protocol.messages import (
     PROTOCOL_VERSION,
-    SCHEMA,
     Answer,
     Disarm,
     Heartbeat,
     Hello,
     Status,
 )
+from robot_bridge.protocol.packing import SCHEMA
 from robot_bridge.protocol.service_end import (
     Answered,
     GaveUp,

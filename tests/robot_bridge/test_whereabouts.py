@@ -52,7 +52,7 @@ def test_the_bound_grows_with_every_way_of_a_counted_axis_until_a_move_is_refuse
         assert client.status.bound_um["xt"] >= 0.05 * 8000 * (number + 1)
         assert client.status.bound_um["yt"] == 0
     assert outcome.code == "beyond_travel"
-    assert "could stand anywhere from" in outcome.text
+    assert "could end up anywhere from" in outcome.text
     assert 3 <= number <= 5  # travel is 10 mm: 8 mm and 5 % of some 40 mm do not fit
 
 

@@ -22,6 +22,7 @@ import numpy as np
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, NewSlice
 from room_config.load import load_config
+from service.room.commands.commands import Commands
 from service.room.control import ControlLoop
 from service.room.link import PumpedClient, RoomLink
 from service.room.state import RoomState
@@ -63,8 +64,12 @@ class LineClient(PumpedClient):
 class LineRoom:
     """`call` orders, `do` what happens to the room, `until` the state is as wanted."""
 
-    def __init__(self, folder: Path, more: str = "", seed: int = 1) -> None:
+    def __init__(
+        self, folder: Path, more: str = "", seed: int = 1, *, many_cases: bool = False
+    ) -> None:
         text = _FILE.format(more=more)
+        if many_cases:
+            text = text.replace('case_dir = "case"', 'cases_dir = "cases"')
         if "confirm_moves = true" in more:
             text = text.replace("confirm_moves = false\n", "")
         (folder / "room.toml").write_text(text)
@@ -216,7 +221,7 @@ class LineRoom:
             self._todo.get_nowait()()
             with_work = not self._todo.empty()
         execution = getattr(self.loop, "_execution", None)
-        if execution is None or not self.scanning:
+        if execution is None or not self.scanning or not isinstance(self.loop._commands, Commands):
             return
         if execution.request is not None:
             self._add_slice(execution.request.hold_id, self.header)
@@ -298,8 +303,10 @@ def patient_mm(row_mm: float, col_mm: float) -> tuple[float, float, float]:
 
 
 @contextmanager
-def running_line_room(folder: Path, more: str = "", seed: int = 1) -> Iterator[LineRoom]:
-    room = LineRoom(folder, more, seed)
+def running_line_room(
+    folder: Path, more: str = "", seed: int = 1, *, many_cases: bool = False
+) -> Iterator[LineRoom]:
+    room = LineRoom(folder, more, seed, many_cases=many_cases)
     room.loop.start()
     try:
         yield room

@@ -16,6 +16,7 @@ from dicom_slice.header import read_header
 from service.procedure.registry import APPROACH
 from service.procedure.steps import HoldShift
 from service.procedure.targets import TARGET_SET
+from service.room.present import READY
 from simulator.config import SliceProtocol, VirtualRoom
 from sr_engine.worker import measure
 
@@ -118,6 +119,7 @@ def come_to_ready(record: CaseRecord) -> int:
         "scan_s": 4.5,
     }
     record.end_procedure(procedure_id, "done", result)
+    record.append_event(READY, {"procedure_id": procedure_id}, source="service")
     return procedure_id
 
 

@@ -261,6 +261,8 @@ def test_health_and_metrics_name_every_part(room: AttendedRoom, state: RoomState
     metrics = httpx.get(f"{room.url}/metrics").text
     assert "autospine_robot_linked 1.0" in metrics
     assert 'autospine_process_up{process="worker"} 1.0' in metrics
+    assert 'autospine_motor_supply_volts{axis="xt"} 47.2' in metrics
+    assert re.search(r'autospine_motor_board_celsius\{axis="yt"\} \d', metrics)
 
 
 def test_a_plan_of_another_number_is_not_confirmed(client: RoomClient, state: RoomState) -> None:

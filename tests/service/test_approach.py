@@ -221,7 +221,7 @@ def test_a_stopped_move_is_never_asked_for_again(calibrated):
     target = beside(calibration, 2.0, -1.0)
     before = len(room.moves)
     room.stop_next_moves = 1
-    with pytest.raises(ProcedureFailedError, match="was stopped on its way"):
+    with pytest.raises(ProcedureFailedError, match="was stopped during the move"):
         room.run(approach(approach_arguments(target), calibration))
     assert len(room.moves) <= before + 1
 

@@ -44,7 +44,7 @@ def test_a_slice_that_came_before_the_hold_settled_is_refused_and_not_offered(ro
     hold_id = waiting_for_a_slice(room)
     code, text = refusal(room, early, hold_id)
     assert code == "not_of_hold"
-    assert f"before the robot stood at hold {hold_id}" in text
+    assert f"before the robot settled at hold {hold_id}" in text
     assert offered(room, early) is None
 
 
@@ -53,7 +53,7 @@ OTHER = {
     "frame of reference": {"frame_of_reference_uid": "1.2.8"},
     "grid": {"geometry": {"shape": [64, 64]}},
     "pixels": {"geometry": {"spacing_mm": [2.0, 2.0]}},
-    "another plane": {"geometry": {"row_direction": [0.0, 1.0, 0.0]}},
+    "a different plane": {"geometry": {"row_direction": [0.0, 1.0, 0.0]}},
     "it lies at": {"geometry": {"position_mm": [0.0, 5.0, 0.0]}},
 }
 
@@ -81,7 +81,7 @@ def test_a_slice_is_offered_for_the_hold_that_stands_and_a_reason_is_asked_for(r
     assert offered(room, slice_id) == hold_id
     assert refusal(room, slice_id, hold_id, why="  ")[0] == "no_reason"
     older = hold_id - 1
-    assert "is over and has all its slices" in refusal(room, slice_id, older)[1]
+    assert "has ended and has all its slices" in refusal(room, slice_id, older)[1]
 
 
 def test_what_rests_on_an_overrule_is_marked_wherever_it_is_shown(room):

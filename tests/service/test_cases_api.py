@@ -41,7 +41,7 @@ def test_five_cases_one_after_the_other_each_of_its_own(tmp_path):
         state = client.state()
         assert state.case_folder is None
         assert state.cases_begin_here
-        assert state.prompt == "Begin a case."
+        assert state.prompt == "Start a case."
         for order in (client.describe_case, client.set_target):
             error = refusal(order, (1.0, 2.0, 3.0) if order == client.set_target else "x")
             assert (error.status, error.code) == (409, "no_case")
@@ -274,8 +274,8 @@ def test_what_waits_is_listed_and_of_another_patient_no_more_than_that_it_waits(
         assert {(one.study, one.description) for one in state.holding} == {
             ("1.2.1", "cor 0"), ("", "")}  # fmt: skip
         error = refusal(client.take_slices, "1.2.2")
-        assert "another patient" in str(error)
-        assert "nothing of the study" in str(refusal(client.take_slices, "1.2.77"))
+        assert "a different patient" in str(error)
+        assert "no slices of study" in str(refusal(client.take_slices, "1.2.77"))
 
 
 def test_another_service_in_the_same_room_is_refused(tmp_path):

@@ -94,17 +94,17 @@ def test_a_commissioning_that_was_broken_off_goes_on_and_ends_with_keys_and_an_a
     first = Commissioning(tmp_path)
     for _ in range(2):
         first.scan(technologist, 1)
-        first.line("4 of 4 slices came")
+        first.line("4 of 4 slices arrived")
     first.line("STARTS")
     first.process.stdin.close()
     assert first.process.wait(60) == 3
-    assert "broken off; call it again with the same --out" in first.process.stdout.read()
+    assert "interrupted; run it again with the same --out" in first.process.stdout.read()
     first.process.stdout.close()
     second = Commissioning(tmp_path)
     assert "Series 3" in second.line("Series")
     for sign in (1, 1, 1, -1):
         second.scan(technologist, sign)
-        second.line("4 of 4 slices came")
+        second.line("4 of 4 slices arrived")
     code, said = second.end()
     assert code == 0, said
     assert "Accepted. Keys for the room's file" in said

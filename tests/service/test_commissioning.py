@@ -92,16 +92,18 @@ def test_without_the_second_readout_the_polarity_is_not_known(session):
 
 def test_two_series_at_once_and_none_at_all_are_each_one_line(session):
     mixed = [*session[0].receptions, *session[1].receptions]
-    with pytest.raises(CommissioningError, match="slices of 2 series came between two presses"):
+    with pytest.raises(
+        CommissioningError, match="slices of 2 series arrived between two key presses"
+    ):
         one_series(mixed, session[0].started, session[1].ended)
-    with pytest.raises(CommissioningError, match="no slice came"):
+    with pytest.raises(CommissioningError, match="no slice arrived"):
         one_series([], session[0].started, session[0].ended)
 
 
 def test_a_slice_without_the_fiducial_says_so(session):
     nothing = [replace(s, receptions=tuple(
         replace(r, pixels=0 * r.pixels + 5.0) for r in s.receptions)) for s in session]  # fmt: skip
-    with pytest.raises(CommissioningError, match="fiducial is not seen"):
+    with pytest.raises(CommissioningError, match="fiducial was not found"):
         find_imaging(nothing, IMAGING)
 
 

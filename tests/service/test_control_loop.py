@@ -107,7 +107,7 @@ def test_a_procedure_that_the_program_fails_at_fails_alone(loop, tmp_path, name,
     wait_for_state(loop, lambda s: s.last_outcome.startswith(f"{name} failed"))
     with CaseRecord(tmp_path / "case") as record:
         assert record.running_procedure() is None
-        assert "program failed" in record.last_ended_procedure().result["reason"]
+        assert "internal error" in record.last_ended_procedure().result["reason"]
         assert record.last_event("procedure_failed").body["procedure_id"] == number
     describe(loop)
 

@@ -118,7 +118,7 @@ def test_a_file_that_is_there_is_not_replaced_and_a_folder_without_a_case_is_nam
     words = autospine("export", str(record.case_dir), "--slicer")
     done = subprocess.run(words, cwd=tmp_path, capture_output=True, text=True)
     assert done.returncode == 2
-    assert "is there already" in done.stderr
+    assert "already exists" in done.stderr
     none = subprocess.run(
         autospine("export", str(tmp_path / "no"), "--slicer"), capture_output=True, text=True
     )

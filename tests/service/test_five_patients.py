@@ -92,7 +92,7 @@ def arm(page: Page, client: RoomClient) -> None:
         if (robot.armed and not robot.stopped and robot.position_certain) or state.question:
             return
         if robot.taken_um:
-            expect(page.locator("#next")).to_contain_text("are taken to stand at")
+            expect(page.locator("#next")).to_contain_text("Assumed stage positions")
         with contextlib.suppress(PlaywrightTimeoutError):  # the page was drawn anew meanwhile
             offered.click(timeout=2000)
         page.wait_for_timeout(200)

@@ -135,7 +135,7 @@ def test_the_line_of_a_state_is_the_guides_true_line():
 
 
 def test_fiducials_further_apart_than_on_the_guide_are_refused():
-    with pytest.raises(GuideSeenWrongError, match=r"34\.0 mm between them cannot"):
+    with pytest.raises(GuideSeenWrongError, match=r"impossible with 34\.0 mm between them"):
         line_of_state(GEOMETRY, np.array([40.0, 0.0, 0.0, 0.0]), PLANE, LOWER_PLANE)
 
 
@@ -199,7 +199,7 @@ def test_fiducials_above_the_top_plane_work_as_well():
 def test_swapped_fiducials_are_noticed_in_the_calibration():
     swapped = replace(GEOMETRY, slice_positions_mm=GEOMETRY.slice_positions_mm[::-1])
     room = make_room(0)
-    with pytest.raises(ProcedureFailedError, match="taken for each other") as failure:
+    with pytest.raises(ProcedureFailedError, match="appear to be swapped") as failure:
         room.run(calibrate_guide(calibration_arguments(geometry=swapped)))
     assert failure.value.code == "fiducials_swapped"
     assert len(room.moves) == 5  # and not moved any further

@@ -55,8 +55,8 @@ def test_a_needle_needs_an_entry_point_and_a_target_within_reach(operator: RoomC
     operator.set_entry((5.0, -22.0, -18.0))
     code, text = refusal(lambda: operator.set_target((5.0, -182.0, -18.0)))
     assert code == "out_of_reach"
-    assert "180.0 mm below the lower ball joint, the needle reaches 120 mm" in text
-    assert "flatter than 30°" in refusal(lambda: operator.set_target((40.0, -30.0, -18.0)))[1]
+    assert "180.0 mm below the lower ball joint; the needle reaches 120 mm" in text
+    assert "less than 30° from" in refusal(lambda: operator.set_target((40.0, -30.0, -18.0)))[1]
 
 
 def test_where_the_guide_points_becomes_entry_and_target(

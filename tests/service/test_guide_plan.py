@@ -100,7 +100,7 @@ def test_a_target_in_tissue_shifts_both_fiducials_alike(tmp_path, start):
     [
         ((6.0, -22.0, -19.0), (6.0, -140.0, -19.0), r"138\.0 mm below .* reaches 120 mm"),
         ((6.0, -22.0, -19.0), (6.0, 5.0, -19.0), r"7\.0 mm above the lower plane"),
-        ((6.0, -22.0, -19.0), (6.0, -22.0, -19.0), "make no line"),
+        ((6.0, -22.0, -19.0), (6.0, -22.0, -19.0), "do not define a line"),
     ],
 )
 def test_a_target_that_no_needle_of_this_guide_reaches_is_refused(tmp_path, start, entry, at, said):
@@ -115,7 +115,7 @@ def test_a_target_that_no_needle_of_this_guide_reaches_is_refused(tmp_path, star
         ("upper_plane_mm = 58.0", "upper_plane_mm = -2.0", "must differ"),
         ("upper_fiducial_mm = 48.0", "upper_fiducial_mm = 14.0", "above lower_fiducial_mm"),
         ("upper_slice_mm = 46.0", "upper_slice_mm = 12.0", "lower_slice_mm must differ"),
-        ("upper_slice_mm = 46.0", "upper_slice_mm = 2.0", "to the side on which upper_plane_mm"),
+        ("upper_slice_mm = 46.0", "upper_slice_mm = 2.0", "on the same side of lower_slice_mm"),
         ("upper_slice_mm = 46.0", 'axes = ["xt", "yt", "xt", "yb"]\nupper_slice_mm = 46.0', "four"),
         ("upper_slice_mm = 46.0", "", "missing key service.guide.upper_slice_mm"),
     ],

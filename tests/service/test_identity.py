@@ -117,7 +117,7 @@ def test_a_proof_move_waits_for_confirmation_like_any_other(tmp_path):
         room.call("set_target", patient_mm=patient_mm(*TARGET_MM))
         room.call("start_approach")
         state = room.until(lambda s: s.question is not None)
-        assert "to see it follow" in state.question.question
+        assert "as a proof move" in state.question.question
         begun = len(room.line.stage.begun)
         room.call("answer", question_id=state.question.question_id, choice="reject")
         state = room.run_to_end()

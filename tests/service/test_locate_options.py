@@ -44,7 +44,7 @@ def test_a_file_of_the_table_that_is_not_beside_it_is_named(
     table = tmp_path / "table.csv"
     table.write_text("file,row_px,col_px\ngone.dcm,0,0\n")
     result = autospine("locate", ring[1], "--template", table)
-    one_line_and_code_2(result, "gone.dcm", "not beside it")
+    one_line_and_code_2(result, "gone.dcm", "not in the same folder")
 
 
 def test_wrong_displacements_make_no_template(ring: tuple[Path, Path, Path]) -> None:

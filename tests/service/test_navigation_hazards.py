@@ -118,8 +118,8 @@ def _one_hold(hold_id):
 def test_h2_why_a_plan_is_void_is_said_with_numbers():
     here = {"xt": 1000, "yt": -5}
     assert why_void(here, 7, {"xt": 1015, "yt": -5}, 7) == ""
-    assert "1.000 mm, now it stands at 1.021 mm" in why_void(here, 7, {"xt": 1021, "yt": -5}, 7)
-    assert "nowhere known" in why_void(here, 7, {"xt": 1000}, 7)
+    assert "1.000 mm; it is now at 1.021 mm" in why_void(here, 7, {"xt": 1021, "yt": -5}, 7)
+    assert "an unknown position" in why_void(here, 7, {"xt": 1000}, 7)
     assert "rests on measurement 7" in why_void(here, 7, here, 8)
 
 
@@ -197,7 +197,7 @@ def test_a_program_that_would_take_other_steps_does_not_go_on(recorded):
     with pytest.raises(Killed):
         run_until(recorded, number, steps=4)
     changed = calibrate(calibration_arguments(move_um=9000))
-    with pytest.raises(ReplayMismatchError, match="must be started anew"):
+    with pytest.raises(ReplayMismatchError, match="start the procedure again"):
         run_procedure(recorded.record, number, changed, recorded.execute, recorded.case.case_uid)
     assert len(recorded.moves) == 2
 

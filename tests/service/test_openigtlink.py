@@ -397,7 +397,7 @@ def test_one_more_than_allowed_is_turned_away_until_another_one_has_gone(tmp_pat
 @pytest.mark.parametrize(
     ("table", "expected"),
     [
-        ("host = '0.0.0.0'\nport = 18944", "peer_networks must say who may connect"),
+        ("host = '0.0.0.0'\nport = 18944", "peer_networks must list who may connect"),
         ("port = 18944\npeer_networks = ['10.0.0.0/99']", "10.0.0.0/99"),
         ("port = 99999", "key openigtlink.port"),
     ],

@@ -134,7 +134,7 @@ def test_a_command_is_answered_with_an_error_under_its_number():
     content = struct.pack(">I128sHI", 4711, b"HOME", 3, 4) + b"HOME"
     (reply,) = said(Message("COMMAND", "Slicer", 1.0, content)).replies
     assert (reply.kind, struct.unpack(">I", reply.content[:4])) == ("RTS_COMMAND", (4711,))
-    assert b"not done from here" in reply.content
+    assert b"not available here" in reply.content
 
 
 def test_the_pose_is_told_or_that_there_is_none():

@@ -192,7 +192,7 @@ def test_a_dead_destination_does_not_hold_up_another_one(case_dir, archive):
             wait_until(lambda: "dead" in store.lines())
             line = store.lines()["dead"]
         assert line.failing_since_s is not None
-        assert "nobody there" in line.reason
+        assert "no response" in line.reason
 
 
 def test_a_destination_that_keeps_silent_does_not_hold_up_another_one(case_dir, archive):
@@ -369,7 +369,7 @@ def test_the_service_shows_the_outbox_in_api_metrics_and_alarms(case_dir, archiv
             state = httpx.get(f"{url}/api/v1/state").json()
             return {alarm["code"]: alarm["text"] for alarm in state["alarms"]}
 
-        wait_until(lambda: "nobody there" in alarms().get("destination_dead", ""))
+        wait_until(lambda: "no response" in alarms().get("destination_dead", ""))
         refused = "archive refused 5 of our DICOM objects"
         wait_until(lambda: alarms().get("refused_archive") == refused)
         wait_until(lambda: "no_link" in alarms())

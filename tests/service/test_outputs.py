@@ -17,6 +17,7 @@ from receivers import needs_program
 from recorded_case import OFFSET_MM, TOLERANCE_MM, come_to_ready, make_case, puncture
 
 from case_record.record import CaseRecord, CaseRecordError
+from case_record.seals import TamperedError
 from service.cli.export import write_export
 from service.dicom_out.codes import CENTRE, CENTRE_ALONG, DEPTH, DISTANCE, PROBABILITY, TOLERANCE
 from service.dicom_out.errors import OutputError
@@ -28,6 +29,7 @@ from service.dicom_out.make import (
     output_of,
     outputs_to_send,
 )
+from service.room.images import reconstruction_pixels
 
 READY_REPORT = Output("approach", 1, "report")
 READY_PRESENTATION = Output("approach", 1, "presentation")
@@ -224,7 +226,7 @@ def test_a_target_outside_of_the_image_is_not_drawn_but_said(record):
     state = dataset_of(far, READY_PRESENTATION)
     layers = {annotation.GraphicLayer for annotation in state.GraphicAnnotationSequence}
     assert layers == {"FIDUCIAL", "NOTES"}
-    assert "outside of this image" in words_of(state)
+    assert "outside this image" in words_of(state)
 
 
 # What the standard asks for
@@ -267,6 +269,47 @@ def test_an_output_made_anew_from_the_same_record_is_the_same_to_the_byte(record
         assert make_output(record, output).read_bytes() == before, output.name
 
 
+def flip(path):
+    content = bytearray(path.read_bytes())
+    content[-20] ^= 1
+    path.write_bytes(content)
+
+
+def test_an_output_that_was_changed_is_not_handed_out_and_one_from_elsewhere_is_made_anew(record):
+    path = make_output(record, READY_REPORT)
+    made = path.read_bytes()
+    flip(path)
+    with pytest.raises(TamperedError, match="not the file that was made"):
+        make_output(record, READY_REPORT)
+    flip(path)
+    other = Output("measurement", 1, "presentation")
+    other.path(record.case_dir).write_bytes(made)  # laid there by whoever, under that name
+    assert make_output(record, other).read_bytes() != made
+    record.verify()
+
+
+def test_a_reconstruction_or_a_slice_that_was_changed_is_found_out(record, tmp_path):
+    output = next(o for o in outputs_to_send(record) if o.kind == "image")
+    result = record.measurement(output.number).result
+    image = record.case_dir / result["reconstruction"]
+    output.path(record.case_dir).unlink(missing_ok=True)
+    flip(image)
+    with pytest.raises(TamperedError):
+        reconstruction_pixels(record, output.number)
+    with pytest.raises(TamperedError):
+        make_output(record, output)
+    with pytest.raises(TamperedError, match="not the image that was made"):
+        write_export(record, tmp_path / "a.zip")
+    flip(image)
+    write_export(record, tmp_path / "a.zip")
+    received = record.case_dir / record.slice(result["slice_id"]).path
+    flip(received)
+    with pytest.raises(TamperedError, match="not the file that was received"):
+        write_export(record, tmp_path / "b.zip")
+    assert not (tmp_path / "b.zip").exists()
+    flip(received)
+
+
 def test_an_output_that_is_there_is_not_made_again(record):
     path = make_output(record, READY_REPORT)
     made_ns = path.stat().st_mtime_ns
@@ -286,16 +329,16 @@ def test_all_uids_are_different_and_only_reports_have_a_series_of_their_own(reco
 
 @pytest.mark.parametrize("name", ["", "approach-0-report", "../case-1-report", "event-1-report"])
 def test_what_is_no_name_of_an_output_is_refused(name):
-    with pytest.raises(OutputError, match="is no output"):
+    with pytest.raises(OutputError, match="is not an output"):
         output_of(name)
 
 
 def test_what_there_is_nothing_about_is_refused(record):
-    with pytest.raises(CaseRecordError, match="there is no measurement 99"):
+    with pytest.raises(CaseRecordError, match="no measurement 99"):
         make_output(record, Output("measurement", 99, "report"))
-    with pytest.raises(CaseRecordError, match="procedure 99 did not come to READY"):
+    with pytest.raises(CaseRecordError, match="procedure 99 did not reach READY"):
         make_output(record, Output("approach", 99, "report"))
-    with pytest.raises(CaseRecordError, match="event 1 is no puncture"):
+    with pytest.raises(CaseRecordError, match="event 1 is not a puncture"):
         make_output(record, Output("puncture", 1, "report"))
 
 
@@ -309,7 +352,7 @@ def test_the_command_says_in_one_line_why_it_makes_none(record):
     ]
     done = subprocess.run(words, capture_output=True, text=True, check=False)
     assert done.returncode == 2
-    assert done.stderr.strip().splitlines()[-1].endswith("procedure 99 did not come to READY")
+    assert done.stderr.strip().splitlines()[-1].endswith("procedure 99 did not reach READY")
 
 
 def violations(dataset: Dataset) -> list[str]:

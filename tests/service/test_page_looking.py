@@ -239,10 +239,10 @@ def test_an_emergency_looks_unlike_a_stop_and_says_what_to_do(
     expect(banner).to_be_hidden()
     page.locator("#emergency").click()
     expect(banner).to_be_visible()
-    expect(banner).to_contain_text("See to the patient and the needle first")
+    expect(banner).to_contain_text("Attend to the patient and the needle first")
     expect(page.locator("#phases [aria-current]")).to_have_text("Emergency")
     expect(page.locator("#prompt")).to_contain_text("re-arm")
-    expect(page.locator("#alarms")).to_contain_text("the drives are parked")
+    expect(page.locator("#alarms")).to_contain_text("drives parked")
     assert [e.kind for e in client.events()][-20:].count("emergency") == 1
     for theme in ("dark", "light"):
         set_theme(page, theme)

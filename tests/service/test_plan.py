@@ -14,6 +14,14 @@ JACOBIAN = ImageJacobian(("xt", "yt"), COLUMNS, np.eye(8) * 1e-8)
 TRAVEL = {"xt": Travel(-20_000, 20_000), "yt": Travel(-20_000, 20_000)}
 
 
+def test_a_setpoint_that_fits_only_if_more_were_known_says_what_to_do():
+    narrowed = {"xt": Travel(-9_741, 9_741, unsure_um=10_259)}
+    with pytest.raises(PlanRefusedError, match=r"known only to within 10\.259 mm.*home it"):
+        check_travel({"xt": 10_000}, narrowed)
+    with pytest.raises(PlanRefusedError, match=r"to 20\.000 mm$"):
+        check_travel({"xt": 20_001}, TRAVEL)
+
+
 def planned(target, start_um=(1000, -500)):
     setpoints = dict(zip(("xt", "yt"), start_um, strict=True))
     estimate = FiducialEstimate(setpoints, np.array([-17.6, 5.3]), np.eye(2) * 1e-4)

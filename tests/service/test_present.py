@@ -5,10 +5,15 @@ import time
 import pytest
 from line_room import patient_mm, running_line_room
 
-from case_record.record import CaseRecord
+from case_record.record import CaseRecord, CaseRecordError
+from service.dicom_out.finding import finding_of_arrival
+from service.dicom_out.make import outputs_to_send
+from service.dicom_out.report import comment_of
 from service.room.context import now_of
 from service.room.present import Now, lost_since_ready, readiness, why_not_now
 from service.room.readiness import ConflictError
+from service.slicer.messages import STATUS_HEAD
+from service.slicer.scene import scene_of, standing
 
 
 @pytest.fixture
@@ -151,6 +156,16 @@ def test_what_changes_after_a_measurement_takes_it_back_wherever_it_is_shown(roo
     with room.record() as record:
         assert lost_since_ready(record, 2) is not None
         assert not record.events_of_kind("puncture")
+        # what is written for good says what was, and of what instant
+        said = comment_of(finding_of_arrival(record, 2))
+        assert "stood at its target when READY was said" in said
+        assert {one.subject for one in outputs_to_send(record)} == {"approach"}
+    # whoever follows by OpenIGTLink
+    scene = scene_of(state)
+    assert STATUS_HEAD.unpack_from(scene["AutoSPINe"].content)[2].rstrip(b"\0") != b"READY"
+    seen = standing(state)
+    assert (seen.arrival, seen.reconstruction) == (None, None)
+    assert (seen.measurement is not None) == (change in _ONLY_READY)
 
 
 @pytest.mark.parametrize("change", ["stop", "target changed", "other study", "park"])
@@ -199,6 +214,39 @@ def test_the_clock_is_set_and_the_next_arrival_locks_all_the_same(room, monkeypa
     with pytest.raises(ConflictError) as refused:
         room.call("jog", axis="xt", distance_um=1000)
     assert refused.value.code == "insertion_locked"
+
+
+def test_a_case_that_has_ended_leaves_nothing_behind_even_if_it_is_opened_again(tmp_path):
+    with running_line_room(tmp_path, many_cases=True) as room:
+        folder = room.call("begin_case", label="anna", operator="", note="")
+        room.ready()
+        with pytest.raises(ConflictError, match="withdrawn"):
+            room.call("finish_case")
+        room.call("puncture")
+        room.call("needle_out")
+        assert room.later().error is not None
+        room.call("finish_case")
+        state = room.later()
+        assert not state.ready
+        for shown in (
+            "case_folder",
+            "measurement",
+            "error",
+            "target_patient_mm",
+            "slice",
+            "arrival",
+        ):
+            assert getattr(state, shown) is None
+        seen = standing(state)
+        assert (seen.measurement, seen.arrival, seen.reconstruction) == (None, None, None)
+        with pytest.raises(ConflictError) as refused:
+            room.call("puncture")
+        assert refused.value.code == "no_case"
+        room.call("reopen_case", folder=folder)
+        state = room.until(lambda s: s.case_folder == folder and s.measurement)
+        assert (state.error, state.measurement.lost.code) == (None, "case_ended")
+        assert not state.calibrated
+        assert standing(state).measurement is None
 
 
 def test_between_a_move_and_the_next_measurement_there_is_no_error(room):
@@ -398,24 +446,68 @@ def test_another_study_voids_the_target_and_not_the_calibration(room):
     assert refused.value.code == "target_void"
 
 
-def test_another_patients_slices_void_nothing(room):
+def another_patient_in_the_case(room):
+    """Where the room has this case only: whatever arrives is recorded in it."""
+    header = {**room.header, "study_instance_uid": "9.9"}
+    room.do(lambda: room._add_slice(None, header, reason_code="other_patient"))
+
+
+def held(room, **body):
+    room.do(lambda: room.loop._record.append_event("slice_held", body, source="listener"))
+
+
+@pytest.mark.parametrize(
+    "comes",
+    [
+        another_patient_in_the_case,
+        lambda room: held(room, code="other_patient"),
+        lambda room: held(room, code="other_study"),
+        lambda room: held(room, code="other_case", same_patient=True),
+    ],
+    ids=["patient aside", "patient held", "study held", "earlier case of this patient"],
+)
+def test_slices_that_are_not_the_cases_own_take_back_ready(room, comes):
+    """Somebody else may lie on the table, or the patient lies on it anew: that is looked at."""
+    target = room.ready().target_patient_mm
+    comes(room)
+    state = room.until(lambda s: s.ready_lost)
+    assert state.ready_lost.code == "other_place"
+    assert state.error is None
+    with pytest.raises(ConflictError):
+        room.call("puncture")
+    # not this case's: neither target nor calibration rests on them
+    assert room.until(lambda s: s.ready_lost).target_patient_mm == target
+    room.call("needle_out")
+    room.ready(-1.0, 0.5)
+
+
+def test_what_is_pushed_late_of_another_patients_earlier_case_takes_back_nothing(room):
     room.ready()
-    room.do(
-        lambda: room._add_slice(
-            None, {**room.header, "study_instance_uid": "9.9"}, reason_code="other_patient"
-        )
-    )
+    held(room, code="other_case", same_patient=False)
     assert room.later().ready
 
 
-def test_a_study_that_waits_outside_of_the_case_takes_back_ready(room):
-    room.ready()
-    room.do(
-        lambda: room.loop._record.append_event(
-            "slice_held", {"code": "other_study"}, source="listener"
-        )
-    )
-    assert room.until(lambda s: s.ready_lost).ready_lost.code == "other_place"
+def test_slices_of_another_frame_between_the_look_and_its_measurement_count_too(room):
+    room.calibrate()
+    room.call("set_target", patient_mm=patient_mm(41.0, 58.0))
+    record, header = room.loop._record, {**room.header, "frame_of_reference_uid": "1.2.8"}
+    request = record.request_measurement
+
+    def table_moves_first(*asked):
+        room._add_slice(None, header, reason_code="other_frame_of_reference")
+        return request(*asked)
+
+    room.do(lambda: setattr(record, "request_measurement", table_moves_first))
+    room.call("start_approach")
+    state = room.run_to_end()
+    assert "approach done" in state.last_outcome
+    state = room.later()
+    assert not state.ready
+    assert state.measurement.lost.code == "other_place"
+    with room.record() as record:  # READY was never said: nothing says that it was
+        assert not list(outputs_to_send(record))
+        with pytest.raises(CaseRecordError, match="did not reach READY"):
+            finding_of_arrival(record, record.last_procedure("approach", "done").procedure_id)
 
 
 @pytest.mark.parametrize(
@@ -459,7 +551,7 @@ def test_slices_of_another_protocol_end_the_approach_that_was_begun_without_them
     room.do(lambda: room.header.update(pixel_bandwidth_hz=250.0))
     room.call("start_approach")
     state = room.run_to_end()
-    assert "another pixel bandwidth (250 instead of 500)" in state.last_outcome
+    assert "a different pixel bandwidth (250 instead of 500)" in state.last_outcome
     assert not state.ready
 
 

@@ -292,7 +292,7 @@ def test_what_others_reach_needs_tokens(tmp_path: Path) -> None:
     text = '[room]\nname = "x"\ncase_dir = "case"\n[service]\nbridge_link = "/dev/null"\n'
     for value, said in (
         ("https://navigator.example.org/", "token"),
-        ("navigator.example.org", "no address"),
+        ("navigator.example.org", "not an address"),
         ("https://x.example/?a=b", "path only"),
     ):
         config.write_text(f'{text}public_url = "{value}"\n')

@@ -14,6 +14,7 @@ import httpx
 import pytest
 from lone_service import CONFIG
 
+from case_record.presence import FOLDER, Hanging, Presence
 from room_config.shell import autospine
 from service.cli import supervisor
 from service.cli.children import rotate
@@ -103,6 +104,67 @@ def test_stop_is_heeded_while_a_child_hangs_and_nothing_is_left(running: Running
             os.kill(pid, 0)
 
 
+BEATING = """
+import sys, time
+from pathlib import Path
+from case_record.presence import Presence
+presence = Presence(Path(sys.argv[1]), "worker")
+print('{"ready": true}', flush=True)
+while True:
+    presence.beat()
+    time.sleep(0.05)
+"""
+
+
+def test_a_child_that_hangs_is_killed_and_started_again(tmp_path: Path) -> None:
+    family = supervisor.Family(tmp_path / "logs")
+    kept = supervisor.Kept(family, "worker", [sys.executable, "-c", BEATING, str(tmp_path)])
+    hanging = Hanging(tmp_path, "up", hung_s=1.0, confirm_s=0.5)
+
+    def look() -> None:
+        kept.look(was_ready=True, hangs="worker" in hanging.look(["worker"]))
+
+    try:
+        wait_until(lambda: look() or kept.is_ready)
+        first = family.children["worker"].process
+        for _ in range(40):  # as long as it beats it is left alone
+            look()
+            time.sleep(0.05)
+        assert first.poll() is None
+        os.kill(first.pid, signal.SIGSTOP)
+        wait_until(lambda: look() or first.poll() is not None)
+        assert first.returncode == -signal.SIGKILL
+        wait_until(lambda: look() or kept.is_ready)
+        assert family.children["worker"].process is not first
+    finally:
+        family.end()
+        hanging.close()
+
+
+def test_a_disk_that_takes_nothing_says_of_nobody_that_it_hangs(tmp_path: Path) -> None:
+    hanging = Hanging(tmp_path, "up", hung_s=0.0, confirm_s=0.5)
+    with Presence(tmp_path, "worker"):
+        wait_until(lambda: hanging.look(["worker"]) == ["worker"])
+        # the supervisor's own beat does not show either, as on a read-only disk
+        (tmp_path / FOLDER / "up").unlink()
+        assert hanging.look(["worker"]) == []
+    hanging.close()
+
+
+@pytest.mark.soak
+def test_every_process_of_the_room_that_hangs_is_started_again(running: RunningUp) -> None:
+    before = running.pids()
+    for pid in before.values():
+        os.kill(pid, signal.SIGSTOP)
+    wait_until(
+        lambda: all(running.pids().get(name) not in (pid, None) for name, pid in before.items())
+    )
+    assert running.process.poll() is None
+    for pid in before.values():
+        with pytest.raises(ProcessLookupError):
+            os.kill(pid, 0)
+
+
 def test_a_room_that_can_never_run_is_said_at_once(tmp_path: Path) -> None:
     wrong = CONFIG.replace('bridge_link = "', 'host = "0.0.0.0"\nbridge_link = "')
     (tmp_path / "room.toml").write_text(wrong + LISTENER)
@@ -157,6 +219,8 @@ def test_the_units_have_the_supervisors_policy(unit: Path) -> None:
     assert service["RestartMaxDelaySec"] == f"{supervisor.LONGEST_PAUSE_S:.0f}s"
     assert float(service["TimeoutStopSec"].rstrip("s")) >= supervisor.END_S
     assert service["UMask"] == "0077"
+    if unit.stem != "autospine-bridge":  # which has a guardian of its own
+        assert float(service["WatchdogSec"].rstrip("s")) > supervisor.HUNG_S
     assert "Requires" not in read["Unit"]  # nobody's end ends another
     words = service["ExecStart"].split()
     name = unit.stem.removeprefix("autospine-")

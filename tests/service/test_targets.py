@@ -130,8 +130,8 @@ def test_entry_and_target_are_met_by_the_needles_line():
 @pytest.mark.parametrize(
     ("entry", "lower_plane_mm", "said"),
     [
-        ((9.0, -20.0, -22.0), -2.0, "make no line"),
-        ((40.0, -20.5, -22.0), -2.0, "flatter than 30°"),
+        ((9.0, -20.0, -22.0), -2.0, "do not define a line"),
+        ((40.0, -20.5, -22.0), -2.0, "less than 30° from"),
         ((9.0, 10.0, -22.0), -30.0, r"10\.0 mm above the lower plane"),
     ],
 )

@@ -4,12 +4,18 @@ Each row: what is wrong, as a map from the motion that the motors were told (mm 
 that the stages make, and how it must end. The true motion of the stages stands beside it.
 """
 
-from collections.abc import Callable, Mapping
+import json
+import socket
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 import pytest
+from attended_room import AttendedRoom, arm, calibrated, running_room, wait_for
 from offline_arguments import approach_arguments, beside, calibration_arguments
 
+from case_record.record import CaseRecord
+from case_record.rows import Move
+from service.client import RoomClient
 from service.procedure.approach import approach
 from service.procedure.calibration import calibrate
 from service.procedure.guide_calibration import _check_shares
@@ -17,8 +23,11 @@ from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.jacobian import ImageJacobian
 from service.procedure.sensing import ABORT, RESCAN, ProcedureFailedError
 from service.procedure.steps import AskOperator, Moved, MoveTo
+from service.room.state import RoomState
 from simulator.config import SliceProtocol, VirtualRoom
+from simulator.scene import true_fiducial_mm
 from simulator.stage_physics import StageParameters
+from simulator.truth_client import TruthAddress, ask_where
 from studies.offline_room import MrImaging, OfflineRoom
 
 Motion = Mapping[str, float]
@@ -201,3 +210,141 @@ def test_two_axes_of_a_stage_that_act_alike_are_refused_at_the_calibration(direc
     with pytest.raises(ProcedureFailedError, match=named):
         _check_shares(guide_jacobian(*directions), GUIDE)
     _check_shares(guide_jacobian((0, 1), (1, 0), (0.1, 1), (1, -0.1)), GUIDE)
+
+
+# The same in running processes: what the stages truly do is what the motors' truth port says.
+
+# the motors' shares in the motion of xt and of yt, and how they slip when the approach begins, mm
+DRIVES: dict[str, tuple[tuple[float, float], tuple[float, float], tuple[float, float]]] = {
+    "axes swapped": ((0, 1), (1, 0), (0, 0)),
+    "sign of xt": ((-1, 0), (0, 1), (0, 0)),
+    "sign of yt": ((1, 0), (0, -1), (0, 0)),
+    "both signs": ((-1, 0), (0, -1), (0, 0)),
+    "xt twice as far": ((2, 0), (0, 1), (0, 0)),
+    "yt half as far": ((1, 0), (0, 0.5), (0, 0)),
+    "xt dead": ((0, 0), (0, 1), (0, 0)),
+    "yt dead": ((1, 0), (0, 0), (0, 0)),
+    "stalled on the way": ((0.6, 0), (0, 0.6), (0, 0)),
+    "nothing moves": ((0, 0), (0, 0), (0, 0)),
+    "axes parallel": ((1, 1), (0, 0), (0, 0)),
+    "yt drags xt along": ((1, 0.6), (0, 1), (0, 0)),
+    "slip of 1 mm": ((1, 0), (0, 1), (1, 0)),
+    "the stage moves with the table": ((1, 0), (0, 1), (0, 2)),
+}
+# what `make test` tries; `make soak` tries all
+SHORT = ("axes swapped", "yt half as far", "slip of 1 mm")
+RIGHT = ((1, 0), (0, 1))
+
+
+class TrueRoom:
+    """Processes of a calibrated room, and the truth about its stages."""
+
+    def __init__(self, room: AttendedRoom, client: RoomClient) -> None:
+        self.room, self.client = room, client
+        self._turn = 0
+        calibrated(client)
+
+    def tell(self, request: str) -> None:
+        """The truth port."""
+        with socket.create_connection(("127.0.0.1", self.room.truth_port), 5) as line:
+            line.sendall(request.encode() + b"\n")
+            with line.makefile() as answer:
+                assert json.loads(answer.readline()) == {"ok": True}
+
+    def drives(self, xt: tuple[float, float], yt: tuple[float, float]) -> None:
+        self.tell(f"drives xt {xt[0]} {xt[1]}")
+        self.tell(f"drives yt {yt[0]} {yt[1]}")
+
+    def stages_mm(self) -> np.ndarray:
+        truth = ask_where(TruthAddress("127.0.0.1", self.room.truth_port))
+        return np.array([truth.positions_mm[axis] for axis in ("xt", "yt")])
+
+    def fiducial_mm(self) -> np.ndarray:
+        """Where it truly is, patient LPS mm."""
+        xt, yt = self.stages_mm()
+        return np.array(true_fiducial_mm(VirtualRoom(), {"xt": xt, "yt": yt}))
+
+    def moves(self) -> list[Move]:
+        with CaseRecord(self.room.folder, read_only=True) as record:
+            return record.moves()
+
+    def begin_approach(self) -> np.ndarray:
+        """To a place beside where the fiducial truly is; return the target, patient mm."""
+        client, sign = self.client, (-1) ** self._turn
+        self._turn += 1
+        target_mm = self.fiducial_mm() + sign * np.array([STEP_MM[1], 0.0, -STEP_MM[0]])
+        client.needle_out()
+        wait_for(client.state, lambda s: not s.robot.insertion_locked)
+        arm(client)
+        client.set_target(tuple(target_mm.tolist()))
+        client.start_approach()
+        return target_mm
+
+    def run_to_end(self) -> RoomState:
+        return wait_for(self.client.state, self._is_over, 180.0)
+
+    def _is_over(self, state: RoomState) -> bool:
+        if state.question is not None:
+            self.client.answer(state.question.question_id, give_up(state.question))
+        return state.procedure is None
+
+
+@pytest.fixture(scope="module")
+def true_room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[TrueRoom]:
+    folder = tmp_path_factory.mktemp("wrong")
+    with running_room(folder) as room, RoomClient(room.url, by="tester") as client:
+        yield TrueRoom(room, client)
+
+
+@pytest.mark.parametrize(
+    "what",
+    [pytest.param(row, marks=() if row in SHORT else pytest.mark.soak) for row in DRIVES],
+)
+def test_a_wrong_robot_drives_once_by_the_truth_port(true_room: TrueRoom, what: str) -> None:
+    xt, yt, slip_mm = DRIVES[what]
+    true_room.begin_approach()
+    # it has looked, and asks whether to move: now it is wrong
+    asked = wait_for(
+        true_room.client.state, lambda s: s.question and "confirm" in s.question.choices
+    )
+    before_mm, moves = true_room.stages_mm(), len(true_room.moves())
+    true_room.drives(xt, yt)
+    for axis, mm in zip(("xt", "yt"), slip_mm, strict=True):
+        true_room.tell(f"slip {axis} {mm}")
+    true_room.client.answer(asked.question.question_id, "confirm")
+    state = true_room.run_to_end()
+    went_mm = np.linalg.norm(true_room.stages_mm() - before_mm)
+    print(what, before_mm, true_room.stages_mm(), state.last_outcome)
+    true_room.drives(*RIGHT)
+    assert not state.ready
+    assert state.last_failure
+    assert len(true_room.moves()) == moves + 1
+    assert went_mm < 2.1 * np.linalg.norm(STEP_MM) + 2.1
+
+
+# too little to tell a wrong robot from a right one, whose scale is known to some per cent
+SLIGHTLY: dict[str, tuple[str, ...]] = {
+    "backlash of 0.3 mm": ("play xt 0.3", "play yt 0.3"),
+    "yt drags xt along a little": ("drives xt 1 0.2",),
+    "xt a tenth too far": ("drives xt 1.1 0",),
+}
+
+
+@pytest.mark.parametrize("what", ["backlash of 0.3 mm"] + [
+    pytest.param(row, marks=pytest.mark.soak) for row in SLIGHTLY if "backlash" not in row
+])  # fmt: skip
+def test_a_slightly_wrong_robot_is_refused_or_followed_by_the_truth_port(true_room, what) -> None:
+    for request in SLIGHTLY[what]:
+        true_room.tell(request)
+    try:
+        target_mm, moves = true_room.begin_approach(), len(true_room.moves())
+        state = true_room.run_to_end()
+        off_mm = true_room.fiducial_mm() - target_mm
+        print(what, off_mm, state.last_outcome)
+        assert state.ready or (state.last_failure and len(true_room.moves()) == moves + 1)
+        if state.ready:
+            assert np.linalg.norm(off_mm) < 3 * TOLERANCE_MM
+    finally:
+        for axis in ("xt", "yt"):
+            true_room.tell(f"play {axis} 0")
+        true_room.drives(*RIGHT)

@@ -116,7 +116,7 @@ def test_a_spot_below_the_resolution_is_not_offered_and_a_small_disc_is() -> Non
 
 def test_radii_below_the_resolution_are_refused_by_name() -> None:
     frame = rician(render_disc((64, 80), (30, 40), 4), 0.03, np.random.default_rng(2))
-    with pytest.raises(ParameterError, match=r"shape shows from 1\.5 px"):
+    with pytest.raises(ParameterError, match=r"visible only from 1\.5 px"):
         detect(frame, (0.5, 1.2))
 
 

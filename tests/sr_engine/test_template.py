@@ -94,7 +94,7 @@ def test_one_frame_and_two_are_too_few(places: np.ndarray) -> None:
 
 def test_frames_without_displacement_cannot_tell_what_moves(places: np.ndarray) -> None:
     frames = frames_at(np.repeat(places[:1], 9, axis=0), np.random.default_rng(5))
-    with pytest.raises(TemplateError, match="stands still"):
+    with pytest.raises(TemplateError, match="static background"):
         learn_template(frames, np.zeros((9, 2)))
 
 

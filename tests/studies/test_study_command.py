@@ -129,7 +129,7 @@ def test_a_cluster_of_two_processes_gives_the_same_numbers(scheduler: str) -> No
         (["--snr", "0"], "--snr is 0"),
         (["--blur", "-1"], "--blur is -1"),
         (["--sensitivity", "1.5"], "sensitivity is 1.5"),
-        (["--shift-set", "spiral"], "no shift set is called 'spiral'"),
+        (["--shift-set", "spiral"], "unknown shift set 'spiral'"),
         (["--out", __file__], "File exists"),
         (["--scheduler", "nonsense://"], "no Dask scheduler at 'nonsense://'"),
     ],

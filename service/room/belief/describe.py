@@ -176,7 +176,7 @@ def why_another_slice(running: Procedure, found: Mapping[str, Any]) -> str:
     sigma_mm = float(np.sqrt(np.trace(covariance) / 2))
     text = f"σ {sigma_mm:.3f} mm: {100 * chance(now):.0f} % sure, {100 * confidence:.0f} % wanted"
     if wanted == frames:
-        return f"{text}; more slices here would not change that: a move will."
+        return f"{text}; more slices here would not help; a move will."
     more = wanted - frames
     slices = "one more slice" if more == 1 else f"{more} more slices"
-    return f"{text}; {slices} would make it."
+    return f"{text}; {slices} should be enough."

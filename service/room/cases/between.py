@@ -37,7 +37,7 @@ class BetweenCases:
             return begin(self._cases, self._config.room.name, arguments["by"], words).name
         if name == "reopen_case":
             return reopen(self._cases, arguments["folder"], arguments["by"]).name
-        text = self.problem or "No case is open: begin one first (New case)."
+        text = self.problem or "No case is open. Start one first (New case)."
         raise ConflictError("no_case", text)
 
     def keep_ready(self) -> None:
@@ -78,12 +78,15 @@ class BetweenCases:
         """What is wrong with the cases."""
         if not self.problem:
             return []
-        what = "Begin another case. Nothing in that folder is changed."
+        what = "Start a new case. Nothing in that folder has been changed."
         return [Condition("case_unusable", "alarm", self.problem, what)]
 
     def _prompt(self, robot: RobotState) -> str:
         if self.problem:
-            return f"{self.problem} Begin another case."
+            return f"{self.problem} Start a new case."
         if robot.linked and robot.insertion_locked:
-            return "Motion is locked for a needle. Begin a case, and say when the needle is out."
-        return "Begin a case."
+            return (
+                "Motion is locked for a needle. Start a case, then confirm when the needle is "
+                "withdrawn."
+            )
+        return "Start a case."

@@ -23,12 +23,13 @@ _ARRIVING = {
     Reason.OTHER_FRAME: "Slices of another frame of reference are arriving",
 }
 _WHAT_TO_DO = {
-    Reason.OTHER_PATIENT: "They wait outside of this case. Check who is on the table.",
-    Reason.OTHER_STUDY: "They wait. If the technologist began another study of this patient, take "
-    "them into the case: what was measured and set before is void then.",
-    Reason.OTHER_CASE: "They wait. They belong to a case of before.",
-    Reason.OTHER_FRAME: "They are set aside: the table or the patient was moved. Go on with the "
-    "new frame of reference: what was measured and set before is void then.",
+    Reason.OTHER_PATIENT: "They are held outside this case. Check who is on the table.",
+    Reason.OTHER_STUDY: "They are held outside this case. If the technologist started a new "
+    "study of this patient, add them to the case; earlier measurements and targets then "
+    "become void.",
+    Reason.OTHER_CASE: "They are held outside this case: they belong to an earlier case.",
+    Reason.OTHER_FRAME: "They are set aside: the table or the patient was moved. To continue, "
+    "accept the new frame of reference; earlier measurements and targets then become void.",
 }
 
 

@@ -21,8 +21,8 @@ FINISHED, REOPENED, CONTINUED = "case_finished", CASE_REOPENED, "case_continued"
 DESCRIBED = "case_described"
 CLOCK_COMPARED, CLOCK_FORGOTTEN = "clock_sync", "clock_reset"
 QUESTION = (
-    "This case was left open on another day. Is it the patient on the table? Go on with it, or "
-    "finish it."
+    "This case was left open on another day. Is this the patient on the table? Continue the "
+    "case, or finish it."
 )
 _SOURCE = "service"
 # who went on with a case past midnight is not asked after a crash in the middle of it
@@ -71,7 +71,7 @@ def set_at_rest(record: CaseRecord) -> None:
         record.end_open_hold(time.time())
         if running is None:
             return
-        reason = "the room was started on another day"
+        reason = "the room was restarted on another day"
         record.end_procedure(running.procedure_id, "aborted", {"reason": reason})
         body = {"procedure_id": running.procedure_id, "name": running.name, "reason": reason}
         record.append_event("procedure_aborted", body, source="record")

@@ -28,8 +28,7 @@ class CaseCommands:
         if self._life.asks and name not in WHILE_ASKING:
             raise ConflictError(
                 "case_of_another_day",
-                "This case was left open on another day: say first whether to go on with it, or "
-                "finish it.",
+                "This case was left open on another day: first continue it or finish it.",
             )
 
     def begin_case(self, by: str, **_: str) -> str:
@@ -37,7 +36,7 @@ class CaseCommands:
         described = self._room.record.last_event("case_described")
         label = str(described.body.get("label") or "") if described else ""
         name = f"{self._room.record.case_dir.name}{f' ({label})' if label else ''}"
-        raise ConflictError("case_open", f"Case {name} is open: finish it before another begins.")
+        raise ConflictError("case_open", f"Case {name} is open: finish it before starting another.")
 
     def reopen_case(self, folder: str, by: str) -> str:
         """Only where none is open."""
@@ -51,12 +50,13 @@ class CaseCommands:
         room, cases = self._room, self._life.cases
         cases.check_may_change()
         if room.record.running_procedure() is not None:
-            raise ConflictError("busy", "A procedure is running: wait for its end or abort it.")
+            raise ConflictError("busy", "A procedure is running: wait until it ends, or abort it.")
         status = room.link.status
         locked = status is not None and status.insertion_locked
         if locked or needle_may_be_in(room.record):
             raise ConflictError(
-                "needle_in", "The needle may be in: say first that it is out, then finish the case."
+                "needle_in",
+                "The needle may be in: confirm that it is withdrawn, then finish the case.",
             )
         self._disarm(by)
         with room.record.transaction():
@@ -101,7 +101,8 @@ class CaseCommands:
     def _refuse_while_measuring(self) -> None:
         if self._room.record.running_procedure() is not None:
             raise ConflictError(
-                "busy", "A procedure is running: end it first, for it rests on the slices so far."
+                "busy",
+                "A procedure is running: end it first, because it relies on the slices so far.",
             )
 
     def all(self) -> tuple[Callable[..., Any], ...]:

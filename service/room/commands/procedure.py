@@ -97,7 +97,9 @@ class ProcedureCommands:
         start = self._room.start_point(guide=True)
         target, entry_mm = self._target(), current_entry(self._room.record)
         if entry_mm is None:
-            raise ConflictError("no_entry", "Set an entry point first: the needle has a direction.")
+            raise ConflictError(
+                "no_entry", "Set an entry point first: it gives the needle its direction."
+            )
         try:
             settings = self._room.settings()
             arguments = guide_approach_of(
@@ -153,7 +155,7 @@ class ProcedureCommands:
         self._room.execution.answer(choice, by)
 
     def _why_closed(self) -> str:
-        text = "This question is not open any more."
+        text = "This question is no longer open."
         ended = self._room.record.last_ended_procedure()
         if self._room.record.running_procedure() is not None or ended is None:
             return text
@@ -163,12 +165,16 @@ class ProcedureCommands:
     def _check_plan(self, plan: Mapping[str, Any], plan_id: str | None) -> None:
         status = self._room.linked()
         if plan_id is not None and plan_id != plan["plan_id"]:
-            raise ConflictError("stale_plan", "This plan was replaced: read the one shown now.")
+            raise ConflictError(
+                "stale_plan", "This plan has been replaced: review the one shown now."
+            )
         if status.stopped or not status.armed:
             raise ConflictError("not_armed", "Re-arm the robot; then start the approach again.")
         newest = self._room.record.last_measurement()
         if newest is not None and newest.measurement_id != plan["measurement_id"]:
-            raise ConflictError("stale_plan", "A newer measurement exists: start again.")
+            raise ConflictError(
+                "stale_plan", "There is a newer measurement: start the approach again."
+            )
         for axis, planned_from_um in plan["from_um"].items():
             moved_um = status.positions_um.get(axis, planned_from_um) - planned_from_um
             if not abs(moved_um) <= self._room.config.service.repeatability_um:
@@ -196,7 +202,7 @@ class ProcedureCommands:
         if found is None:
             raise ConflictError("not_ready", "The needle guide is not at a target (not READY).")
         if found.lost is not None:
-            text = f"READY was lost: {found.lost.text}. Measure again before the puncture."
+            text = f"READY was lost: {found.lost.text}. Measure again before puncturing."
             raise ConflictError("not_ready", text)
         if not found.ready:
             raise ConflictError("not_ready", "Motion is not locked yet: wait for READY.")

@@ -108,7 +108,9 @@ class ProposalCommands:
             return Verdict("invalid", why)
         others = [one for one in known if one.state == "open" and one.sender != plan.sender]
         if len(others) >= MOST_OPEN:
-            return Verdict("too_many", f"{len(others)} proposals wait for the operator already")
+            return Verdict(
+                "too_many", f"{len(others)} proposals are already waiting for the operator"
+            )
         if why := why_not_in_bore(plan):
             return Verdict("out_of_reach", why)
         try:
@@ -128,13 +130,13 @@ class ProposalCommands:
         plan = Plan(one.sender, one.name, one.via, one.target_mm, one.entry_mm, one.direction)
         why = why_other_frame(one.frame_of_reference_uid, frame_of_reference(room.record))
         if why:
-            raise ConflictError("other_frame", f"Not taken over: {why}.")
+            raise ConflictError("other_frame", f"Not accepted: {why}.")
         entry_mm = one.entry_mm
         try:
             if plan.target_mm is not None:
                 check_reach(room, plan, in_water=in_water)
         except OutOfReachError as error:
-            raise ConflictError("out_of_reach", f"Not taken over: {error}.") from error
+            raise ConflictError("out_of_reach", f"Not accepted: {error}.") from error
         except ReachUnknownError:
             pass  # an approach asks again before anything moves
         guide = room.config.service.guide
@@ -189,4 +191,4 @@ def _same(one: ProposalState, plan: Plan) -> bool:
 
 def _waits(one: ProposalState) -> str:
     note = f"; {one.note}" if one.note else ""
-    return f"proposal {one.number} waits for the operator{note}"
+    return f"proposal {one.number} is waiting for the operator{note}"

@@ -25,10 +25,12 @@ class RecordCommands:
         if hold_id is not None:
             refused = why_not_by_hand(record, row, record.hold(hold_id), self._planes_mm())
             if refused:
-                text = f"Slice {slice_id} is not of hold {hold_id}: {refused}. Rescan."
+                text = f"Slice {slice_id} does not belong to hold {hold_id}: {refused}. Rescan."
                 raise ConflictError("not_of_hold", text)
             if not why.strip():
-                raise ConflictError("no_reason", "Say why this slice is of that hold after all.")
+                raise ConflictError(
+                    "no_reason", "Give a reason why this slice belongs to that hold."
+                )
         reassign(record, slice_id, hold_id, by, why.strip())
 
     def _planes_mm(self) -> tuple[float, ...]:
@@ -40,7 +42,8 @@ class RecordCommands:
         hold = self._room.record.hold(hold_id)
         if hold.ended_at_s is None and self._room.record.running_procedure() is not None:
             raise ConflictError(
-                "busy", f"Hold {hold_id} stands and its slices are asked for: end the procedure."
+                "busy",
+                f"Slices are still being requested for hold {hold_id}: end the procedure first.",
             )
         give_up_slices(self._room.record, hold_id, by, why)
 

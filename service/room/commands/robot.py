@@ -48,8 +48,8 @@ class RobotCommands:
         if said_um is None or said_um.keys() != taken.keys():
             raise ConflictError(
                 "position_unconfirmed",
-                f"{in_words(taken)} Nothing is armed until somebody says that they stand there "
-                "(positions_um), or where they stand.",
+                f"{in_words(taken)} The robot is not armed until someone confirms these "
+                "positions or gives the right ones (positions_um).",
             )
         counted_um = {axis: status.positions_um.get(axis, 0) for axis in taken}
         within_um = {
@@ -79,8 +79,7 @@ class RobotCommands:
         try:
             check_travel({axis: setpoint_um}, travel)
         except PlanRefusedError as error:
-            known = f"; where it is is known to within {status.bound_um.get(axis, 0) / 1000:.3f} mm"
-            raise ConflictError("out_of_travel", f"Not moved: {error}{known}.") from error
+            raise ConflictError("out_of_travel", f"Not moved: {error}.") from error
         setpoints_um = {**status.positions_um, axis: setpoint_um}
         return self._room.begin(JOG, {"setpoints_um": setpoints_um}, by)
 

@@ -19,9 +19,11 @@ class SettingsCommands:
     ) -> None:
         """From the next procedure of this case on; ConflictError outside the room's bounds."""
         if self._room.record.running_procedure() is not None:
-            raise ConflictError("busy", "A procedure is running: change settings after it.")
+            raise ConflictError(
+                "busy", "A procedure is running: change settings when it has ended."
+            )
         if strategy not in STRATEGIES:
-            raise ConflictError("out_of_bounds", f"There is no strategy {strategy!r}.")
+            raise ConflictError("out_of_bounds", f"Unknown strategy {strategy!r}.")
         bounds = bounds_of(self._room.config)
         values: dict[str, float] = {"tolerance_mm": tolerance_mm, "confidence": confidence}
         values["most_slices"] = most_slices

@@ -36,7 +36,7 @@ class TargetCommands:
     ) -> None:
         """Set where the fiducial is to be, in patient mm (LPS); in_water: a place in tissue."""
         if len(patient_mm) != 3 or not all(math.isfinite(value) for value in patient_mm):
-            raise ConflictError("bad_target", "A target is three finite numbers, patient mm.")
+            raise ConflictError("bad_target", "A target needs three finite numbers (patient mm).")
         x, y, z = (float(value) for value in patient_mm)
         self._judge((x, y, z), in_water)
         self._void_plan_for(by, "target was changed")
@@ -53,7 +53,7 @@ class TargetCommands:
         if in_water and not self._room.config.imaging.readout_polarity:
             raise ConflictError(
                 "no_polarity",
-                "Not set: for a target in tissue the readout's polarity must be known "
+                "Not set: a target in tissue needs the readout polarity "
                 "(imaging.readout_polarity in the room's file).",
             )
         try:
@@ -94,7 +94,7 @@ class TargetCommands:
         try:
             known = target_that_can_be_taken(self._room.record, number)
         except TargetError as error:
-            raise ConflictError("no_target", f"Not taken: {error}.") from error
+            raise ConflictError("no_target", f"Not set: {error}.") from error
         self._void_plan_for(by, "target was changed")
         body: dict[str, Any] = {"patient_mm": list(known.patient_mm), "label": known.label}
         if known.frame is not None:  # it is where it was set, not where it is chosen again
@@ -134,8 +134,8 @@ class TargetCommands:
         if running.name not in APPROACHES or question is None or question.plan is None:
             raise ConflictError("busy", "Abort the running procedure before changing the target.")
         reason = (
-            f"the {what} by {by} while a move waited for confirmation: the move is not made, "
-            "start the approach again"
+            f"the {what} by {by} while a move was waiting for confirmation; the move was not "
+            "made. Start the approach again"
         )
         body = {"plan_id": question.plan["plan_id"], "reason": reason}
         self._room.note("plan_void", by, body)

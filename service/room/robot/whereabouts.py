@@ -38,13 +38,13 @@ def taken_to_stand(status: BridgeStatus) -> dict[str, TakenAt]:
 def in_words(taken: Mapping[str, TakenAt]) -> str:
     """One sentence that says where, and from what."""
     places = ", ".join(f"{axis} {one.at_um / 1000:.3f} mm" for axis, one in taken.items())
-    return f"The stages are taken to stand at {places}, from {source_of(taken)}."
+    return f"Assumed stage positions: {places} ({source_of(taken)})."
 
 
 def source_of(taken: Mapping[str, TakenAt]) -> str:
     known = [one.within_um for one in taken.values() if one.within_um is not None]
     if not known:
-        return "the motors' count alone (it may begin at zero anywhere)"
-    text = f"what the bridge remembers, give or take {max(known) / 1000:.3f} mm"
+        return "motor count only; its zero may be anywhere"
+    text = f"last known to the bridge, ± {max(known) / 1000:.3f} mm"
     counted = [axis for axis, one in taken.items() if one.within_um is None]
-    return f"{text}; {', '.join(counted)} from the motor's count alone" if counted else text
+    return f"{text}; {', '.join(counted)}: motor count only" if counted else text

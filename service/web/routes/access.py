@@ -27,7 +27,7 @@ def access_router(access: Access, *, cookie_path: str = "/") -> APIRouter:
     async def log_in(request: Request, response: Response, body: LoginBody) -> SessionBody:
         """Log in with a token; the session is kept in an HttpOnly cookie."""
         if not access.rules.needs_token:
-            raise ProblemError(409, "no_tokens", "This room uses no tokens: nothing to log in to.")
+            raise ProblemError(409, "no_tokens", "This room uses no tokens: no login is needed.")
         try:
             identity = check_token(access, request.scope, body.token)
         except PermissionError as error:

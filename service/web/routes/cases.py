@@ -17,7 +17,7 @@ from service.web.schemas import Ask, CaseBegun, CaseBody, StudyBody
 Folder = Annotated[
     str,
     PathParameter(
-        min_length=1, max_length=255, description="Name of a folder that /api/v1/cases lists."
+        min_length=1, max_length=255, description="A folder name as listed by /api/v1/cases."
     ),
 ]
 

@@ -25,7 +25,7 @@ from service.web.problems import responses
 
 Window = Annotated[float | None, Query(gt=0, le=1e9, allow_inf_nan=False)]
 Level = Annotated[float | None, Query(ge=-1e9, le=1e9, allow_inf_nan=False)]
-Scale = Annotated[int, Query(ge=1, le=8, description="Each pixel becomes this many squared.")]
+Scale = Annotated[int, Query(ge=1, le=8, description="Enlargement along rows and columns.")]
 Match = Annotated[str | None, Header(alias="If-None-Match")]
 
 

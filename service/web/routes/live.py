@@ -25,7 +25,7 @@ def live_router(loop: ControlLoop, broadcast: Broadcast) -> APIRouter:
     async def state() -> Response:
         """What the room is doing now; 503 while the control loop does not say."""
         if loop.state_age_s > STALE_S:
-            detail = f"The control loop has said nothing for {loop.state_age_s:.1f} s."
+            detail = f"The control loop has been silent for {loop.state_age_s:.1f} s."
             raise ProblemError(503, "stale_state", detail)
         # the state was checked when it was made; many ask for it often
         return Response(loop.state.model_dump_json(), media_type="application/json")
@@ -48,7 +48,7 @@ def live_router(loop: ControlLoop, broadcast: Broadcast) -> APIRouter:
         """The state whenever it changes, every event of the record after the given one."""
         if broadcast.viewers >= MOST_VIEWERS:
             wait = {"Retry-After": "5"}
-            raise ProblemError(429, "busy", f"{MOST_VIEWERS} are looking on already.", wait)
+            raise ProblemError(429, "busy", f"{MOST_VIEWERS} are already watching.", wait)
         if last_event_id is not None and last_event_id.isdecimal():
             after = min(int(last_event_id), MOST_ID)
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}

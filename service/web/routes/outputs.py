@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 import threading
+from pathlib import Path
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Query
@@ -158,8 +159,7 @@ class _Desk:
 
     def hand_out(self, case: AskedCase, output: Output) -> FileResponse:
         path = output.path(case.folder)
-        if not path.is_file():
-            self._check(case, output)
+        if not self._is_there(case, output, path):
             self._make(case, output)
         return FileResponse(
             path,
@@ -168,12 +168,15 @@ class _Desk:
             headers={"Cache-Control": "private, no-cache"},
         )
 
-    def _check(self, case: AskedCase, output: Output) -> None:
+    def _is_there(self, case: AskedCase, output: Output, path: Path) -> bool:
         """CaseRecordError or ImageMissingError (404) before a process is started for nothing."""
         with case.record() as record:
+            if path.is_file() and record.is_sealed(f"{path.parent.name}/{path.name}"):
+                return True
             found = _FIND[output.subject](record, output.number)
         if output.kind == "image" and not found.result.get("reconstruction"):
             raise ImageMissingError(f"measurement {output.number} has no reconstruction")
+        return False
 
     def _make(self, case: AskedCase, output: Output) -> None:
         if not self._turn.acquire(timeout=_TURN_S):

@@ -15,7 +15,7 @@ from service.web.schemas import JogBody, ResetBody, Started, StopAnswer, StopBod
 
 STOP_WORDS = {
     "stopped": "Stopped.",
-    "on_its_way": "STOP is on its way: the robot does not stand yet.",
+    "on_its_way": "STOP is on its way: the robot has not stopped yet.",
     "not_delivered": "STOP was NOT DELIVERED – USE THE STOP SWITCH at the robot.",
 }
 _STOP_PATIENCE_S, _STOP_LOOK_S = 0.7, 0.01
@@ -35,7 +35,7 @@ def stop_router(loop: ControlLoop) -> APIRouter:
             "requestBody": {
                 "required": False,
                 "description": "Optional: `by`, and `emergency` to park the drives as well. "
-                "Whatever cannot be understood does not keep the STOP back.",
+                "An unreadable body never holds back the STOP.",
                 "content": {"application/json": {"schema": {}, "example": _STOP_EXAMPLE}},
             }
         },
@@ -44,7 +44,7 @@ def stop_router(loop: ControlLoop) -> APIRouter:
         """Stop the robot at once; latched until re-armed. Viewers may do this too.
 
         The answer says what became of it, within a second: `stopped`, `on_its_way` (the bridge has
-        it, the robot does not stand yet) or `not_delivered`: use the stop switch at the robot. The
+        it, the robot has not stopped yet) or `not_delivered`: use the stop switch at the robot. The
         service goes on trying. Orders that were asked for before this answer are void.
         """
         body = _stop_body(await request.body())

@@ -1,0 +1,59 @@
+"""Whether an encoder follows its motor: over a short run, and on the way to a target."""
+
+from robot_bridge.daemon.config import AxisConfig
+from robot_bridge.pmd import units as pmd_units
+from robot_bridge.pmd.setup import MIN_SPEED_HZ
+
+# An encoder that shows no progress: far from the setpoint, where the motor runs fast, it is missed
+# at once; near it the controller may well take its time.
+STALL_WINDOW_S, FAR_WINDOW_S = 0.5, 0.15
+FAR_TOLERANCES, LOOKS_MIN = 10, 4
+STALE_S = 0.12
+RUNAWAY_MARGIN_UM = 100.0
+# Of the way that the steps should make: load and frequency change a step by a quarter, and a wrong
+# scale is most often one of two.
+FOLLOWS = 0.6
+
+
+def agrees(moved_um: float, distance_um: float) -> bool:
+    """Whether an encoder's way fits the way that the motor's steps should have made."""
+    return FOLLOWS < moved_um / distance_um < 1 / FOLLOWS
+
+
+def disagreement(moved_um: float, distance_um: float) -> str:
+    return (
+        f"the motor moved {distance_um:+.0f} um by its steps but {moved_um:+.0f} um by the "
+        "encoder: the encoder, its direction, counts_per_mm or the step lengths are wrong"
+    )
+
+
+class ProgressWatch:
+    """Tells a motor that does not come nearer (stalled, encoder lost) or runs away."""
+
+    def __init__(self, config: AxisConfig, distance_um: float, now_s: float) -> None:
+        self._best_um = distance_um
+        self._best_s = now_s
+        self._looks = 0
+        self._bound_um = distance_um + RUNAWAY_MARGIN_UM
+        slowest_um_s = MIN_SPEED_HZ * config.step_um_forward
+        self._resolution_s = 3 * pmd_units.um_per_count(config) / slowest_um_s
+        self._far_um = FAR_TOLERANCES * config.tolerance_um
+
+    def is_stale(self, now_s: float) -> bool:
+        return now_s - self._best_s > STALE_S
+
+    def is_away(self, error_um: float) -> bool:
+        return error_um > self._bound_um
+
+    def what_is_wrong(self, error_um: float, now_s: float) -> tuple[str, str] | None:
+        """A code and a text, or None."""
+        self._looks += 1
+        if error_um < self._best_um:
+            self._best_um, self._best_s, self._looks = error_um, now_s, 0
+        if self.is_away(error_um):
+            return "runaway", f"is moving away, {error_um:.0f} um from the setpoint"
+        far = error_um > self._far_um and self._looks >= LOOKS_MIN
+        window_s = (FAR_WINDOW_S if far else STALL_WINDOW_S) + self._resolution_s
+        if now_s - self._best_s > window_s:
+            return "stalled", f"stalled {error_um:.0f} um from the setpoint"
+        return None
