@@ -107,7 +107,7 @@ export const TEXTS = {
     reachable: "Within the robot's travel.", unreachable: (axis, mm, low, high) => `Out of reach: axis ${axis} would have to go to ${mm} mm (travel ${low} to ${high} mm).`,
     empty: (field) => `Not set: ${field} is empty.`,
     reachUnknown: "Reach is known after a calibration.",
-    told: { within: () => "Within the robot's travel.", out: (why) => `Out of reach: ${why}.`, unknown: (why) => `Reach is not known yet: ${why}.` },
+    told: { within: () => "Within the robot's travel.", out: (why) => `Out of reach: ${why}.`, unknown: (why) => `${why.charAt(0).toUpperCase()}${why.slice(1)}.` },
     setTarget: "Set target", setEntry: "Set entry point", withdraw: "Withdraw the target", cancel: "Cancel",
     notSlice: "The point lies in the slice that is shown.",
   },

@@ -141,7 +141,7 @@ def test_with_four_axes_each_fiducials_distance_is_shown_before_each_confirm(
         x, y, z = found.measurement.patient_mm
         page.locator("#pick").click()
         facts = page.locator("#pick-panel .facts")
-        expect(facts).to_contain_text("Reach is not known yet: the needle's direction is not known")
+        expect(facts).to_contain_text("The needle's direction is not known")
         client.set_entry((x + 1.0, y - 40.0, z + 1.0))
         for axis, place, said in (("y", y - 82.0, "Within"), ("x", x + 90.0, "Out of reach")):
             page.locator(f"#pick-{axis}").fill(f"{place:.2f}")
