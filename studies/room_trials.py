@@ -15,7 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,9 +31,12 @@ from studies.navigation_study import NavigationStudy
 
 LOG = "punctures.jsonl"
 _POLL_S = 0.1
-_GONE_S = 60.0
+_GONE_S = 120.0
+_BUSY = 503
 _MOST_FAILURES = 4
 _LOOKED_BACK = 900  # events: an approach and what may follow it have fewer
+
+Seen = TypeVar("Seen")
 
 
 class StudyEndedError(Exception):
@@ -274,7 +277,7 @@ class RoomTrials:
     def _minutes(self, procedure_id: int) -> float:
         """From the start of an approach to its end, by the events of the room."""
         after = max(0, self._look().event_id - _LOOKED_BACK)
-        events = self._client.events(after=after)
+        events = self._events(after)
         mine = [event for event in events if event.body.get("procedure_id") == procedure_id]
         ended_s = [event.wall_s for event in mine if event.kind == "procedure_done"]
         return (ended_s[0] - mine[0].wall_s) / 60 if ended_s else 0.0
@@ -285,7 +288,7 @@ class RoomTrials:
         number = start()
 
         def end() -> EventBody | None:
-            events = self._client.events(after=before)
+            events = self._events(before)
             ends = (e for e in events if e.kind.startswith("procedure_"))
             return next((e for e in ends if e.body.get("procedure_id") == number), None)
 
@@ -330,14 +333,22 @@ class RoomTrials:
             self._told = text
 
     def _look(self) -> RoomState:
+        return self._read(self._client.state)
+
+    def _events(self, after: int) -> list[EventBody]:
+        return self._read(partial(self._client.events, after=after))
+
+    def _read(self, look: Callable[[], Seen]) -> Seen:
+        """Look again while the service is gone or too busy, for a while."""
         deadline_s = time.monotonic() + _GONE_S
         while True:
             try:
-                return self._client.state()
-            except ServiceGoneError as error:
-                if time.monotonic() > deadline_s:
-                    raise StudyEndedError(f"{error}; run this again once it is back") from error
-                time.sleep(_POLL_S)
+                return look()
+            except (ServiceGoneError, RefusedByServiceError) as error:
+                busy = getattr(error, "status", _BUSY) == _BUSY
+                if not busy or time.monotonic() > deadline_s:
+                    raise StudyEndedError(f"{error}; run this again to go on") from error
+            time.sleep(_POLL_S)
 
 
 def _belief(state: RoomState) -> BeliefState:

@@ -68,7 +68,7 @@ def output_of(name: str) -> Output:
 
 
 def outputs_to_send(record: CaseRecord, after_measurement: int = 0) -> Iterator[Output]:
-    """What is sent unasked: reconstructions, reports of every READY and puncture, plans."""
+    """What is sent unasked: reconstructions, reports of every READY and puncture."""
     while rows := record.page_of_measurements(
         after_id=after_measurement, limit=_AT_ONCE, newest=False
     ):
@@ -81,6 +81,10 @@ def outputs_to_send(record: CaseRecord, after_measurement: int = 0) -> Iterator[
         yield Output("approach", procedure_id, "presentation")
     for event in record.events_of_kind("puncture"):
         yield Output("puncture", event.event_id, "report")
+
+
+def plans_to_send(record: CaseRecord) -> Iterator[Output]:
+    """Target and entry point, whenever they changed: for whoever asks for them."""
     for event in plan_events(record):
         yield Output("plan", event.event_id, "plan")
 

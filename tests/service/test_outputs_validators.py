@@ -22,7 +22,7 @@ from recorded_case import come_to_ready, make_case, puncture
 from case_record.record import CaseRecord
 from dicom_slice.plan import plan_in
 from service.dicom_out.identity import MAKER
-from service.dicom_out.make import Output, make_output, outputs_to_send
+from service.dicom_out.make import Output, make_output, outputs_to_send, plans_to_send
 
 # What the validators say of every case, and why it is so. docs/dicom_outputs.md has the same table.
 EXPLAINED = {
@@ -41,7 +41,8 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     with CaseRecord(case_dir) as record:
         for _ in range(5):
             puncture(record, come_to_ready(record))
-        made = [make_output(record, output) for output in outputs_to_send(record)]
+        wanted = [*outputs_to_send(record), *plans_to_send(record)]
+        made = [make_output(record, output) for output in wanted]
         made.append(make_output(record, Output("measurement", 1, "report")))
         made.append(make_output(record, Output("measurement", 1, "presentation")))
     return [*sorted((case_dir / "inbox").iterdir()), *made]
