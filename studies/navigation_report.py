@@ -84,7 +84,7 @@ def print_tables(study: NavigationStudy, console: Console) -> None:
         )
     console.print(ours)
     _print_paper(study, console)
-    console.print("Not in the paper, assumed here:")
+    console.print("Not given in the paper, assumed here:")
     for name, text in ASSUMPTIONS.items():
         console.print(f"  {name}: {text}", highlight=False)
 

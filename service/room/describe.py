@@ -40,7 +40,7 @@ from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why
 from service.room.prompt import is_calibrated, is_punctured, next_action, outcome_text, prompt
 from service.room.proposals import ProposalBook
 from service.room.robot.whereabouts import source_of, taken_to_stand
-from service.room.scanner_clock import clock_update
+from service.room.scanner_clock import clock_update, clock_was_set
 from service.room.state import (
     AcquisitionState,
     ArrivalState,
@@ -137,7 +137,8 @@ class Describer:
         )
         other = _other(record, state.other_fiducial, now)
         state = state.model_copy(update={"other_fiducial": other})
-        wrong = [*conditions(state), *arriving(record), *self._others_wrong()]
+        wrong = [*conditions(state), *clock_was_set(config, record), *arriving(record)]
+        wrong += self._others_wrong()
         alarms = self._alarms.update(wrong, record)
         state = state.model_copy(update={"alarms": alarms})
         same = _timeless(state) == _timeless(before)

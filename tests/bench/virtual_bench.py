@@ -53,7 +53,8 @@ class BenchDemoRoom(DemoRoom):
         url = str(self.family.start("virtual camera", words)["url"])
         listener = tables["listener"]
         # one computer, one clock
-        listener.update(clock_offset_s=0.0, clock_uncertainty_s=0.02, camera_slices=True)
+        listener.update(clock_offset_s=0.0, clock_uncertainty_s=0.02, clock_may_be_set=False)
+        listener["camera_slices"] = True
         tables["imaging"].update(
             fiducial_radius_min_mm=RADIUS_MM[0], fiducial_radius_max_mm=RADIUS_MM[1]
         )

@@ -278,7 +278,7 @@ def test_the_clocks_are_compared_by_typing_what_the_scanner_shows(
     assert -37.2 - 0.7 <= event.body["offset_s"] <= -37.2 + 0.7 + pressed_s - read_s
     assert event.body["uncertainty_s"] == 1.0
     expect(card).to_contain_text("by operator")
-    page.get_by_role("button", name="The scanner clock was changed: forget this").click()
+    page.get_by_role("button", name="The scanner clock was changed: discard this").click()
     expect(card).to_contain_text("Not compared")
     client.compare_clocks(-37.2, 0.02)
 

@@ -97,6 +97,8 @@ class TargetCommands:
             raise ConflictError("no_target", f"Not set: {error}.") from error
         self._void_plan_for(by, "target was changed")
         body: dict[str, Any] = {"patient_mm": list(known.patient_mm), "label": known.label}
+        if known.found_by is not None:
+            body["found_by"] = known.found_by.to_json()
         if known.frame is not None:  # it is where it was set, not where it is chosen again
             body |= {"scan_frame": known.frame.to_json(), "scan_frame_seq": known.frame_seq}
         self._room.note(TARGET_SET, by, {**body, "in_water": known.in_water, "again": number})
