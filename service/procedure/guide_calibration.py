@@ -8,13 +8,20 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.procedure.calibration import Calibration, drive_and_learn
+from service.procedure.calibration import DISC, Calibration, Templates, drive_and_learn
 from service.procedure.estimate import FiducialEstimate
 from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_looking import BothSeen, gates, see_both
 from service.procedure.jacobian import SMALLEST_ANGLE_DEG, ImageJacobian
-from service.procedure.sensing import Expectation, ProcedureFailedError, ValidationGate
-from service.procedure.steps import ProcedureSteps
+from service.procedure.sensing import (
+    ML,
+    TEMPLATE,
+    Expectation,
+    ProcedureFailedError,
+    ValidationGate,
+    measure_step,
+)
+from service.procedure.steps import HoldShift, Measured, ProcedureSteps, ask
 
 Array = NDArray[np.float64]
 _FIRST_GATE = 1.4
@@ -30,6 +37,7 @@ class GuideCalibrationArguments:
     move_um: int
     geometry: GuideGeometry
     gate: ValidationGate
+    localization: str = DISC
 
 
 def calibrate_guide(arguments: GuideCalibrationArguments) -> ProcedureSteps[Calibration]:
@@ -39,7 +47,25 @@ def calibrate_guide(arguments: GuideCalibrationArguments) -> ProcedureSteps[Cali
         before: FiducialEstimate | None, predicted: FiducialEstimate | None
     ) -> ProcedureSteps[BothSeen]:
         expected = _expectations(arguments, before, predicted)
-        return (yield from see_both(arguments.geometry, expected))
+        by_template = arguments.localization == TEMPLATE
+        return (yield from see_both(arguments.geometry, expected, any_shape=by_template))
+
+    def look_by_template(
+        last: BothSeen, expected: FiducialEstimate, templates: Templates
+    ) -> ProcedureSteps[tuple[Measured, ...]]:
+        answers = []
+        places = zip(
+            last.acquired,
+            gates(expected, arguments.gate),
+            arguments.geometry.slice_positions_mm,
+            templates,
+            strict=True,
+        )
+        for acquired, expectation, at_mm, template in places:
+            holds = (HoldShift(acquired.hold_id, (0.0, 0.0)),)
+            step = measure_step(holds, ML, expectation, slice_position_mm=at_mm, template=template)
+            answers.append((yield from ask(step, Measured)))
+        return tuple(answers)
 
     return (
         yield from drive_and_learn(
@@ -48,6 +74,7 @@ def calibrate_guide(arguments: GuideCalibrationArguments) -> ProcedureSteps[Cali
             arguments.gate,
             look,
             lambda jacobian: _check_shares(jacobian, arguments.geometry),
+            look_by_template if arguments.localization == TEMPLATE else None,
         )
     )
 
