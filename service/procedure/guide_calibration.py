@@ -4,11 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.procedure.calibration import Calibration, drive_and_learn
+from service.procedure.calibration import Calibration, check_is_as_last, drive_and_learn
 from service.procedure.estimate import FiducialEstimate
 from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_looking import BothSeen, gates, see_both
@@ -23,13 +24,18 @@ _SHARE_TOLERANCE = 0.35
 
 @dataclass(frozen=True)
 class GuideCalibrationArguments:
-    """axes: the top stage's two, then the bottom stage's two."""
+    """axes: the top stage's two, then the bottom stage's two.
+
+    last: this robot's last image Jacobian with four axes; same_mount: not mounted anew since.
+    """
 
     axes: tuple[str, str, str, str]
     origin_um: Mapping[str, int]
     move_um: int
     geometry: GuideGeometry
     gate: ValidationGate
+    last: Mapping[str, Any] | None = None
+    same_mount: bool = False
 
 
 def calibrate_guide(arguments: GuideCalibrationArguments) -> ProcedureSteps[Calibration]:
@@ -41,15 +47,15 @@ def calibrate_guide(arguments: GuideCalibrationArguments) -> ProcedureSteps[Cali
         expected = _expectations(arguments, before, predicted)
         return (yield from see_both(arguments.geometry, expected))
 
-    return (
-        yield from drive_and_learn(
-            _places(arguments),
-            ImageJacobian.unknown(arguments.axes),
-            arguments.gate,
-            look,
-            lambda jacobian: _check_shares(jacobian, arguments.geometry),
-        )
+    found = yield from drive_and_learn(
+        _places(arguments),
+        ImageJacobian.unknown(arguments.axes),
+        arguments.gate,
+        look,
+        lambda jacobian: _check_shares(jacobian, arguments.geometry),
     )
+    check_is_as_last(found, arguments.last, arguments.gate, same_mount=arguments.same_mount)
+    return found
 
 
 def _places(arguments: GuideCalibrationArguments) -> list[dict[str, int]]:
