@@ -9,13 +9,26 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from service.procedure.calibration import Calibration, check_is_as_last, drive_and_learn
+from service.procedure.calibration import (
+    DISC,
+    Calibration,
+    Templates,
+    check_is_as_last,
+    drive_and_learn,
+)
 from service.procedure.estimate import FiducialEstimate
 from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_looking import BothSeen, gates, see_both
 from service.procedure.jacobian import SMALLEST_ANGLE_DEG, ImageJacobian
-from service.procedure.sensing import Expectation, ProcedureFailedError, ValidationGate
-from service.procedure.steps import ProcedureSteps
+from service.procedure.sensing import (
+    ML,
+    TEMPLATE,
+    Expectation,
+    ProcedureFailedError,
+    ValidationGate,
+    measure_step,
+)
+from service.procedure.steps import HoldShift, Measured, ProcedureSteps, ask
 
 Array = NDArray[np.float64]
 _FIRST_GATE = 1.4
@@ -34,6 +47,7 @@ class GuideCalibrationArguments:
     move_um: int
     geometry: GuideGeometry
     gate: ValidationGate
+    localization: str = DISC
     last: Mapping[str, Any] | None = None
     same_mount: bool = False
 
@@ -45,7 +59,25 @@ def calibrate_guide(arguments: GuideCalibrationArguments) -> ProcedureSteps[Cali
         before: FiducialEstimate | None, predicted: FiducialEstimate | None
     ) -> ProcedureSteps[BothSeen]:
         expected = _expectations(arguments, before, predicted)
-        return (yield from see_both(arguments.geometry, expected))
+        by_template = arguments.localization == TEMPLATE
+        return (yield from see_both(arguments.geometry, expected, any_shape=by_template))
+
+    def look_by_template(
+        last: BothSeen, expected: FiducialEstimate, templates: Templates
+    ) -> ProcedureSteps[tuple[Measured, ...]]:
+        answers = []
+        places = zip(
+            last.acquired,
+            gates(expected, arguments.gate),
+            arguments.geometry.slice_positions_mm,
+            templates,
+            strict=True,
+        )
+        for acquired, expectation, at_mm, template in places:
+            holds = (HoldShift(acquired.hold_id, (0.0, 0.0)),)
+            step = measure_step(holds, ML, expectation, slice_position_mm=at_mm, template=template)
+            answers.append((yield from ask(step, Measured)))
+        return tuple(answers)
 
     found = yield from drive_and_learn(
         _places(arguments),
@@ -53,6 +85,7 @@ def calibrate_guide(arguments: GuideCalibrationArguments) -> ProcedureSteps[Cali
         arguments.gate,
         look,
         lambda jacobian: _check_shares(jacobian, arguments.geometry),
+        look_by_template if arguments.localization == TEMPLATE else None,
     )
     check_is_as_last(found, arguments.last, arguments.gate, same_mount=arguments.same_mount)
     return found

@@ -40,6 +40,8 @@ def implied(config: Config, compared: ClockState | None, now_s: float) -> str:
             return f"Not compared, and no delay has been measured here: {_WAITS}."
         return f"Not compared: slices are judged by the delay measured here, at most {most_s:g} s."
     ends_s = _made_s(compared) + 60 * config.listener.comparison_valid_min
+    if now_s < ends_s and most_s is None and config.listener.clock_may_be_set:
+        return f"Used at the hold at which it was made. At others, {_WAITS}."
     if now_s < ends_s:
         wait_s = start_margin_s(config, compared, now_s)
         return f"Used for slices acquired {wait_s:.1f} s or more after the robot settled."
