@@ -59,7 +59,7 @@ class Placement(_Table):
 
 
 class Fiducial(_Table):
-    """A sphere of vitamin E in a polymer shell."""
+    """Vitamin E in a polymer shell: a sphere, or an oval one that a cannula goes through."""
 
     name: Annotated[str, Field(min_length=1)] = "upper"
     """Its name in the truth file."""
@@ -77,6 +77,24 @@ class Fiducial(_Table):
     """Of the oil."""
     shell_signal: Annotated[float, Field(ge=0)] = 0.0
     """Of the shell: printed polymer gives none."""
+    oval: Annotated[float, Field(ge=1, le=1.5)] = 1.0
+    """Longer over shorter diameter of a coronal section; 1: a sphere."""
+    oval_deg: Annotated[float, Field(ge=0, lt=180)] = 30.0
+    """Direction of the longer one, from the image's rows towards its columns."""
+    cannula_mm: Annotated[float, Field(ge=0)] = 0.0
+    """Diameter of the void that a cannula through the fiducial, along the slice normal, leaves; 0:
+    none."""
+
+    @model_validator(mode="after")
+    def _cannula_fits(self) -> "Fiducial":
+        if not self.cannula_mm < 2 * self.radius_mm / self.oval**0.5:
+            raise ValueError("cannula_mm leaves nothing of the fiducial")
+        return self
+
+
+FiducialKind = Literal["cannulated", "sphere"]
+CANNULATED = {"oval": 1.06, "cannula_mm": 4.0}
+"""What a printed fiducial that sits on a needle guide of brass is like, beside a plain sphere."""
 
 
 class StaticObject(_Table):

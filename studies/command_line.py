@@ -13,6 +13,7 @@ from typing import Annotated, Literal
 import typer
 
 from room_config.exit_codes import BAD_INPUT
+from simulator.config import FiducialKind
 
 app = typer.Typer(no_args_is_help=True, help="Repeat the paper's experiments beside our own.")
 
@@ -72,7 +73,10 @@ def numerical(
 
 @app.command()
 def benchtop(
-    trials: Annotated[int, typer.Option(help="Punctures per strategy, in rooms of 14.")] = 140,
+    trials: Annotated[
+        int | None,
+        typer.Option(help="Punctures per strategy: 140, in rooms of 14; with --room 14."),
+    ] = None,
     seed: Annotated[
         int, typer.Option(help="Seed of every random draw; the same seed gives the same numbers.")
     ] = 1,
@@ -85,10 +89,39 @@ def benchtop(
     step_scatter: Annotated[
         float, typer.Option(help="Relative scatter of the motors' step length.")
     ] = 0.002,
+    room: Annotated[
+        Path | None, typer.Option(help="Drive this real room instead (its room.toml); needs --out.")
+    ] = None,
+    strategies: Annotated[
+        str, typer.Option(help="With --room: those to compare, in this order.")
+    ] = "base,bicubic,sr,hybrid,adaptive",
+    measured: Annotated[
+        Path | None,
+        typer.Option(help="With --room: places as CSV, or a folder of photos STRATEGY.png."),
+    ] = None,
+    px_per_mm: Annotated[float | None, typer.Option(help="Scale of the photos.")] = None,
+    hole_mm: Annotated[
+        tuple[float, float], typer.Option(help="Least and largest radius of a hole in the photos.")
+    ] = (0.1, 0.8),
 ) -> None:
-    """The paper's Table III, benchtop columns: every strategy steers by the camera."""
+    """The paper's Table III, benchtop columns: every strategy steers by the camera.
+
+    With --room it drives the real room through the paper's Table II; the same command again goes on
+    where it ended.
+    """
     with _one_line_errors():
-        _run_navigation("benchtop", trials, seed, out, as_json, scheduler, snr, step_scatter)
+        if room is None:
+            _run_navigation(
+                "benchtop", trials or 140, seed, out, as_json, scheduler, snr, step_scatter
+            )
+            return
+        if out is None:
+            raise ValueError("--room needs --out: the folder in which the study is kept")
+        # Loaded here, so that the command's help costs nothing.
+        from studies.room_study import Asked, run_in_room
+
+        asked = Asked(strategies, trials or 14, seed, measured, px_per_mm, hole_mm)
+        run_in_room(room, out, asked, as_json=as_json)
 
 
 @app.command()
@@ -106,10 +139,16 @@ def mri(
     step_scatter: Annotated[
         float, typer.Option(help="Relative scatter of the motors' step length.")
     ] = 0.002,
+    fiducial: Annotated[
+        FiducialKind,
+        typer.Option(help="A sphere, or slightly oval with a cannula's void."),
+    ] = "sphere",
+    encoders: Annotated[bool, typer.Option("--encoders", help="On every axis.")] = False,
 ) -> None:
     """The paper's Table III, MRI columns: every strategy steers by the virtual scanner."""
     with _one_line_errors():
-        _run_navigation("mri", trials, seed, out, as_json, scheduler, snr, step_scatter)
+        room = (fiducial, encoders)
+        _run_navigation("mri", trials, seed, out, as_json, scheduler, snr, step_scatter, room)
 
 
 def _run_navigation(
@@ -121,6 +160,7 @@ def _run_navigation(
     scheduler: str | None,
     snr: float,
     step_scatter: float,
+    room: tuple[FiducialKind, bool] = ("sphere", False),
 ) -> None:
     checks = (
         (3 <= trials <= 1_000_000, f"--trials is {trials}; allowed: 3 to 1000000"),
@@ -138,7 +178,10 @@ def _run_navigation(
 
     if out is not None:
         out.mkdir(parents=True, exist_ok=True)
-    groups = navigation_study.groups_of(setup, trials, seed, snr, step_scatter)
+    fiducial, encoders = room
+    groups = navigation_study.groups_of(
+        setup, trials, seed, snr, step_scatter, fiducial, encoders=encoders
+    )
     with cluster.mapper(scheduler) as mapper, _progress_bar("rooms", len(groups)) as advance:
         study = navigation_study.run_study(setup, groups, mapper, advance)
     files: list[Path] = []
@@ -146,7 +189,8 @@ def _run_navigation(
         files = navigation_report.write_csv(study, out)
         files += navigation_report.draw_punctures(study, out)
     if as_json:
-        settings = {"trials": trials, "seed": seed, "snr": snr, "step_scatter": step_scatter}
+        settings: dict[str, object] = {"trials": trials, "seed": seed, "snr": snr}
+        settings |= {"step_scatter": step_scatter, "fiducial": fiducial, "encoders": encoders}
         typer.echo(json.dumps(navigation_report.as_json(study, settings, files), allow_nan=False))
         return
     console = Console()

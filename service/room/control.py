@@ -418,6 +418,7 @@ class ControlLoop:
             "in_water": False,
             "procedure_id": recorded.procedure_id,
             "sigma_mm": place.to_json()["sigma_mm"],
+            "found_by": place.calibration.found_by.to_json(),
         }
         frame = frame_of(self._record, self._record.measurement(place.calibration.measurement_id))
         if frame is not None:

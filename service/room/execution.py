@@ -34,7 +34,7 @@ from service.room.link import RoomLink
 from service.room.measuring import measure_request, measured_from_result
 from service.room.present import RESTS_ON, bridge_facts, rests_on, why_stood_no_more
 from service.room.scanner_clock import clock_margin_s, is_by_another_clock
-from sr_engine.worker import is_at_position
+from sr_engine.request import is_at_position
 
 _SERVICE = "service"
 _STOPPED_BY_PEOPLE = frozenset({Code.OPERATOR_STOP.value, Code.EMERGENCY_STOP.value})

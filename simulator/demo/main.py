@@ -21,7 +21,7 @@ from case_record.record import CaseRecord
 from room_config.exit_codes import BAD_INPUT, COULD_NOT, INTERRUPTED
 from service.cli.children import ChildError, quiet_environment
 from service.client import RoomClient
-from simulator.config import parse_virtual_room
+from simulator.config import FiducialKind, parse_virtual_room
 from simulator.demo.attended import attend_room
 from simulator.demo.operator import WHO, DemoFailedError, Operator
 from simulator.demo.room import DemoOptions, DemoRoom, known_faults
@@ -51,6 +51,10 @@ def demo(
     guide: Annotated[
         bool, typer.Option("--guide", help="Two fiducials and four axes, steering the needle tip.")
     ] = False,
+    fiducial: Annotated[
+        FiducialKind,
+        typer.Option(help="Slightly oval with a cannula's void, or a plain sphere."),
+    ] = "cannulated",
     page_port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free port.")] = 0,
     dicom_port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free port.")] = 0,
     attended: Annotated[
@@ -84,6 +88,7 @@ def demo(
             tokens=tokens,
             guide=guide,
             attended=attended,
+            fiducial=fiducial,
         )
         if attended:
             code = attend(DemoRoom(options))

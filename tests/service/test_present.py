@@ -3,7 +3,7 @@
 import time
 
 import pytest
-from line_room import patient_mm, running_line_room
+from line_room import IMAGING, patient_mm, running_line_room
 
 from case_record.record import CaseRecord, CaseRecordError
 from service.dicom_out.finding import finding_of_arrival
@@ -565,7 +565,7 @@ def test_a_target_set_where_oil_appeared_is_not_approached_by_another_protocol(r
 
 
 def test_with_the_polarity_known_the_target_follows_the_protocol(tmp_path):
-    more = "[imaging]\nreadout_polarity = 1\n"
+    more = f"{IMAGING}readout_polarity = 1\n"
     with running_line_room(tmp_path, more) as room:
         room.ready()
         room.call("needle_out")
