@@ -134,6 +134,7 @@ def fuzz_one(operation: Any, examples: int, callers: tuple[Call, ...]) -> str:
     return ""
 
 
+@pytest.mark.timeout(900)
 def test_whoever_asks_whatever_nothing_fails_and_every_answer_is_as_documented(
     guarded_url: str,
 ) -> None:
