@@ -112,7 +112,7 @@ def _fiducials(
         imaging.fiducial_radius_max_mm / spacing_mm,
     )
     if len({reception.pixels.shape for reception in receptions}) > 1:
-        raise CommissioningError("the slices are not all of one size: scan with one protocol")
+        raise CommissioningError("the slices differ in size: scan with one protocol")
     mean = np.mean([reception.pixels for reception in receptions], axis=0)
     try:
         start_px = _start(mean, imaging, radii)
