@@ -227,7 +227,8 @@ class PmdController:
     def refresh(self) -> Procedure:
         """Status and position while nothing of ours moves."""
         at_um = yield from self._look()
-        if self.at_rest_um is not None and not self._is_near(at_um, self.at_rest_um):
+        was_um = self.position_um if self.at_rest_um is None else self.at_rest_um
+        if not self._is_near(at_um, was_um):
             at_um = yield from self._look()  # it may have been the line
         if self.closed_loop:
             self.position_um = at_um
