@@ -56,6 +56,7 @@ class PmdAxis(PmdController):
         self._holds_motion = False  # a motion is stored on the board
         self._begun_s = 0.0  # when what moves it was sent
         self.unread = False  # it was stopped on its way, and nobody has asked yet where it stands
+        self._doubted: tuple[float, float] | None = None  # where it was seen last, and its way
         self.within_um: float | None = None  # after a run that was cut short: of its readback
 
     @property
@@ -99,12 +100,22 @@ class PmdAxis(PmdController):
             self.certain = False
             self.unread = False
             raise
+        self._was_read()
+
+    def _was_read(self) -> None:
+        """An encoder that was not seen to follow for long has to have moved on meanwhile."""
         self.unread = False
+        if self._doubted is None:
+            return
+        (from_um, way_um), self._doubted = self._doubted, None
+        gone_um = (self.position_um - from_um) * (1 if way_um > 0 else -1)
+        if gone_um <= self.jitter_um:
+            self.certain = False
 
     def refresh(self) -> Procedure:
         yield from self._forget_stored()  # of a motion that was stopped
         yield from super().refresh()
-        self.unread = False
+        self._was_read()
 
     def stands_at(self, setpoint_um: float) -> bool:
         return self._is_near(self.position_um, setpoint_um)
@@ -119,9 +130,12 @@ class PmdAxis(PmdController):
             yield from self.read_status()
             yield from self.check_status()
             yield from self.read_position()
+            self._was_read()
             self.check_rest()
             if self.stands_at(setpoint_um):
                 return
+            if not self.certain:
+                raise self.error("position_uncertain", "it was not seen where it was stopped")
             yield from verify(self)
             yield from self.unpark()
             yield from self.read_position()
@@ -199,8 +213,8 @@ class PmdAxis(PmdController):
         try:
             yield from self._follow(setpoint_um, watch)
         except GeneratorExit:  # stopped on the way
-            if watch.is_stale(self.clock()):
-                self.certain = False  # its encoder may just have died
+            if watch.is_stale(self.clock()):  # its encoder may just have died
+                self._doubted = (self.position_um, setpoint_um - self.position_um)
             raise
         yield from self._leave_target_mode()
         yield from self._forget_stored()
