@@ -219,6 +219,7 @@ class PmdAxis(PmdController):
         yield from self._leave_target_mode()
         yield from self._forget_stored()
         yield from self.read_position_surely()
+        yield from self.check_no_reset()
         self.unread = False
 
     def _follow(self, setpoint_um: int, watch: ProgressWatch) -> Steps[None]:

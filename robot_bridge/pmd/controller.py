@@ -241,9 +241,13 @@ class PmdController:
     def _look(self) -> Steps[float]:
         """The position, and then whether the board had lost its supply before it told that."""
         at_um = yield from self.ask_position()
+        yield from self.check_no_reset()
+        return at_um
+
+    def check_no_reset(self) -> Steps[None]:
+        """After a position was read: a board that has lost its supply counts from zero again."""
         yield from self.read_status()
         yield from self.check_status()
-        return at_um
 
     def _is_near(self, at_um: float, other_um: float) -> bool:
         return abs(at_um - other_um) <= self.config.tolerance_um
