@@ -100,6 +100,7 @@ class PmdAxis(PmdController):
             self.certain = False
             self.unread = False
             raise
+        self.at_rest_um = self.position_um
         self._was_read()
 
     def _was_read(self) -> None:
@@ -127,19 +128,15 @@ class PmdAxis(PmdController):
     def move(self, setpoint_um: int, park_afterwards: bool) -> Procedure:
         self.fault = None
         try:
-            yield from self.read_status()
-            yield from self.check_status()
-            yield from self.read_position()
+            yield from self.look_at_rest()
             self._was_read()
-            self.check_rest()
             if self.stands_at(setpoint_um):
                 return
             if not self.certain:
                 raise self.error("position_uncertain", "it was not seen where it was stopped")
             yield from verify(self)
             yield from self.unpark()
-            yield from self.read_position()
-            self.check_rest()
+            yield from self.look_at_rest()
             yield from self._prove(setpoint_um)
             for leg_um in pmd_units.legs_um(self.config, self.position_um, setpoint_um):
                 if self.closed_loop:

@@ -226,6 +226,14 @@ class PmdController:
 
     def refresh(self) -> Procedure:
         """Status and position while nothing of ours moves."""
+        yield from self.look_at_rest()
+        if self.at_rest_um is None:
+            self.at_rest_um = self.position_um
+        yield from self._read_supply_if_due()
+        self.fault = None
+
+    def look_at_rest(self) -> Steps[None]:
+        """Raises AxisFaultError if it does not rest."""
         at_um = yield from self._look()
         was_um = self.position_um if self.at_rest_um is None else self.at_rest_um
         if not self._is_near(at_um, was_um):
@@ -233,10 +241,6 @@ class PmdController:
         if self.closed_loop:
             self.position_um = at_um
         self.check_rest()
-        if self.at_rest_um is None:
-            self.at_rest_um = self.position_um
-        yield from self._read_supply_if_due()
-        self.fault = None
 
     def _look(self) -> Steps[float]:
         """The position, and then whether the board had lost its supply before it told that."""
