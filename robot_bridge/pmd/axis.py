@@ -21,7 +21,7 @@ from robot_bridge.pmd.controller import (
     Steps,
 )
 from robot_bridge.pmd.line import Pause, Procedure
-from robot_bridge.pmd.progress import ProgressWatch, agrees, disagreement
+from robot_bridge.pmd.progress import CutLeg, ProgressWatch, agrees, disagreement
 from robot_bridge.pmd.protocol import (
     MICROSTEPS_PER_STEP,
     Command,
@@ -56,7 +56,7 @@ class PmdAxis(PmdController):
         self._holds_motion = False  # a motion is stored on the board
         self._begun_s = 0.0  # when what moves it was sent
         self.unread = False  # it was stopped on its way, and nobody has asked yet where it stands
-        self._doubted: tuple[float, float] | None = None  # where it was seen last, and its way
+        self._cut_leg: CutLeg | None = None
         self.within_um: float | None = None  # after a run that was cut short: of its readback
 
     @property
@@ -74,6 +74,8 @@ class PmdAxis(PmdController):
     def read_status(self) -> Steps[Status]:
         asked_s = self.clock()
         status = yield from super().read_status()
+        if self._cut_leg is not None and not status & (Status.RUNNING | Status.TARGET_MODE):
+            self._cut_leg.stood_s = min(self._cut_leg.stood_s, self.clock())
         run = self._run or self._cut
         if run is not None:
             run.saw(bool(status & Status.RUNNING), asked_s, self.clock())
@@ -104,13 +106,15 @@ class PmdAxis(PmdController):
         self._was_read()
 
     def _was_read(self) -> None:
-        """An encoder that was not seen to follow for long has to have moved on meanwhile."""
+        """The encoder may have died before the stop; one not seen to follow for long must have
+        gone on.
+        """
         self.unread = False
-        if self._doubted is None:
+        if self._cut_leg is None:
             return
-        (from_um, way_um), self._doubted = self._doubted, None
-        gone_um = (self.position_um - from_um) * (1 if way_um > 0 else -1)
-        if gone_um <= self.jitter_um:
+        leg, self._cut_leg = self._cut_leg, None
+        self.within_um = leg.unsure_um(self.position_um)
+        if leg.stale and leg.gone_um(self.position_um) <= self.jitter_um:
             self.certain = False
 
     def refresh(self) -> Procedure:
@@ -134,6 +138,7 @@ class PmdAxis(PmdController):
                 return
             if not self.certain:
                 raise self.error("position_uncertain", "it was not seen where it was stopped")
+            self.within_um = None  # the bridge has taken it into account
             yield from verify(self)
             yield from self.unpark()
             yield from self.look_at_rest()
@@ -210,8 +215,13 @@ class PmdAxis(PmdController):
         try:
             yield from self._follow(setpoint_um, watch)
         except GeneratorExit:  # stopped on the way
-            if watch.is_stale(self.clock()):  # its encoder may just have died
-                self._doubted = (self.position_um, setpoint_um - self.position_um)
+            self._cut_leg = CutLeg(
+                self.position_um,
+                watch.last_look_s,
+                setpoint_um - self.position_um,
+                watch.fastest_um_s,
+                watch.is_stale(self.clock()),
+            )
             raise
         yield from self._leave_target_mode()
         yield from self._forget_stored()
@@ -225,6 +235,7 @@ class PmdAxis(PmdController):
         while True:
             yield Pause(POLL_PAUSE_S)
             status = yield from self.read_status()
+            asked_s = self.clock()
             yield from self.read_position()
             yield from self._check_moving()
             error_um = abs(self.position_um - setpoint_um)
@@ -243,7 +254,7 @@ class PmdAxis(PmdController):
             if watch.is_away(error_um):  # a count that was reset in between looks the same
                 yield from self.read_status()
                 yield from self.check_status()
-            if wrong := watch.what_is_wrong(error_um, self.clock()):
+            if wrong := watch.what_is_wrong(error_um, asked_s, self.clock()):
                 self.certain = False
                 raise self.error(*wrong)
 
@@ -389,7 +400,7 @@ class PmdAxis(PmdController):
     def _declared(self) -> None:
         self.at_rest_um = self.position_um
         self.certain = True
-        self._cut = self.within_um = None
+        self._cut = self._cut_leg = self.within_um = None
         self.fault = None
 
     # Stopping
