@@ -26,7 +26,7 @@ demo: $(VENV)/.runtime
 
 test: $(VENV)/.dev
 	sh tests/system_packages.sh
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile $(ARGS)
+	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 # The pure tests: no processes, no browser.
 quick: $(VENV)/.dev

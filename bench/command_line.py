@@ -29,13 +29,14 @@ def camera(
         Path | None, typer.Option(help="The room's TOML file; its [camera] table.")
     ] = None,
     board: Annotated[
-        str, typer.Option(help="Pictures of a checkerboard (pattern or folder): learn the lens.")
+        str,
+        typer.Option(help="Pictures of a checkerboard (pattern or folder), to calibrate the lens."),
     ] = "",
-    squares: Annotated[str, typer.Option(help="Squares of the board: ROWSxCOLUMNS.")] = "8x11",
-    square_mm: Annotated[float, typer.Option(help="Side of a square.", min=0.1)] = 5.0,
-    out: Annotated[Path, typer.Option(help="Where the lens file goes.")] = Path("lens.json"),
+    squares: Annotated[str, typer.Option(help="Squares on the board: ROWSxCOLUMNS.")] = "8x11",
+    square_mm: Annotated[float, typer.Option(help="Side length of a square.", min=0.1)] = 5.0,
+    out: Annotated[Path, typer.Option(help="The lens file to write.")] = Path("lens.json"),
     exit_with_parent: Annotated[
-        bool, typer.Option(help="Stop when standard input is closed.")
+        bool, typer.Option(help="Exit when standard input is closed.")
     ] = False,
 ) -> int:
     """Slices from a camera: acquires what the service asks for and sends it by C-STORE.
@@ -76,16 +77,21 @@ def _learn(board: str, squares: str, square_mm: float, out: Path) -> int:
     try:
         rows, cols = (int(number) for number in squares.lower().split("x"))
     except ValueError:
-        raise CameraConfigError(f"--squares {squares}: ROWSxCOLUMNS is wanted, as 8x11") from None
+        raise CameraConfigError(
+            f"--squares {squares}: expected ROWSxCOLUMNS, such as 8x11"
+        ) from None
     if min(rows, cols) < 3 or rows == cols:
-        raise CameraConfigError(f"--squares {squares}: at least 3, and not as many each way")
+        raise CameraConfigError(
+            f"--squares {squares}: at least 3 each way, and the two must differ"
+        )
     files = picture_files(board)
     if not files:
-        raise CameraConfigError(f"--board {board}: no pictures there")
+        raise CameraConfigError(f"--board {board}: no pictures found")
     lens = learn_lens([read_picture(file) for file in files], (rows, cols), square_mm)
     out.write_text(json.dumps(lens.to_json(), indent=1) + "\n", encoding="utf-8")
     print(
-        f"{out}: {lens.px_per_mm:.4f} px/mm; the board's corners fit to {lens.residual_px:.2f} px "
+        f"{out}: {lens.px_per_mm:.4f} px/mm; the board's corners fit to within "
+        f"{lens.residual_px:.2f} px "
         f"({len(files)} pictures)"
     )
     return DONE

@@ -37,12 +37,12 @@ class CameraConfig(BaseModel):
     """Number or path of a video device (0, /dev/video0), a video file, pictures (frames/*.png), or
     an http, https or rtsp address."""
     colour: Literal["redness", "greenness", "blueness", "grey", "dark"] = "redness"
-    """What the circle is brighter in than its surroundings: redness for a red circle on white."""
+    """Channel in which the circle is brighter than its surroundings: redness for red on white."""
     lens_file: str = ""
-    """Made by `autospine camera --board`; corrects the lens and knows the scale. Relative to this
+    """Made by `autospine camera --board`; corrects the lens and gives the scale. Relative to this
     file."""
     sensor_px_per_mm: Positive | None = None
-    """Scale where there is no lens_file; an error in it is found by the calibration moves."""
+    """Scale if there is no lens_file; the calibration moves reveal an error in it."""
     shape: tuple[Annotated[int, Field(ge=32, le=2048)], Annotated[int, Field(ge=32, le=2048)]] = (
         128,
         128,
@@ -55,23 +55,23 @@ class CameraConfig(BaseModel):
     frames: Annotated[int, Field(ge=1, le=1000)] = 4
     """Pictures that are averaged into one slice."""
     latency_s: Annotated[float, Field(ge=0, le=10)] = 0.2
-    """A picture that arrives now was exposed no longer ago than this."""
+    """Longest delay between the exposure of a picture and its arrival."""
     stall_s: Positive = 2.0
-    """No picture for so long: the camera has stalled."""
+    """No picture for this long means that the camera has stalled."""
     most_overexposed: Annotated[float, Field(ge=0, le=1)] = 0.005
-    """Largest share of the picture's pixels that may stand at the top of the range."""
+    """Largest fraction of the picture's pixels that may be overexposed."""
     service_url: Annotated[str, Field(pattern=r"^https?://[^\s/]+")] = "http://127.0.0.1:8080"
     """The service, which says what to acquire next."""
     token_file: str = ""
-    """File with the token that the service asks for; AUTOSPINE_TOKEN goes before it."""
+    """File with the token that the service asks for; AUTOSPINE_TOKEN overrides it."""
     listener_host: str = "127.0.0.1"
-    """Where slices are sent to; the port and AE title are those of `[listener]`."""
+    """Where slices are sent; the port and AE title are those of `[listener]`."""
     ae_title: AeTitle = "BENCHCAMERA"
     """Calling AE title, and the station's name."""
     poll_s: Positive = 0.05
-    """How often the service is asked."""
+    """How often the service is polled."""
     retry_s: Positive = 0.5
-    """From a failed delivery until the next attempt."""
+    """Wait after a failed delivery before the next attempt."""
     retries: Annotated[int, Field(ge=0)] = 120
     """Attempts after the first."""
     preview_port: Annotated[int, Field(ge=0, le=65535)] | None = 8090

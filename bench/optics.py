@@ -112,7 +112,7 @@ def learn_lens(pictures: list[Picture], squares: tuple[int, int], square_mm: flo
     seen = []
     for number, picture in enumerate(pictures, start=1):
         if picture.shape[:2] != shape:
-            raise CameraError(f"picture {number} of the board has another size than the first")
+            raise CameraError(f"picture {number} of the board differs in size from the first")
         grey = np.ascontiguousarray(picture.mean(axis=2).round().astype(np.uint8))
         found, corners = cv2.findChessboardCornersSB(
             grey, inner, flags=cv2.CALIB_CB_ACCURACY | cv2.CALIB_CB_EXHAUSTIVE
@@ -146,8 +146,8 @@ def learn_lens(pictures: list[Picture], squares: tuple[int, int], square_mm: flo
     scale = float(np.sqrt(abs(np.linalg.det(steps[1:] - steps[0]))))
     if not (0 < scale < 1e4 and residual_px < 2.0):
         raise CameraError(
-            f"the board's corners do not fit a lens (rms {residual_px:.1f} px, "
-            f"{scale:.3g} px a mm): take sharper pictures of a flat board"
+            f"the board's corners fit no lens model (rms {residual_px:.1f} px, "
+            f"{scale:.3g} px per mm): take sharper pictures of a flat board"
         )
     return Lens(**{**vars(lens), "px_per_mm": scale})
 
@@ -173,7 +173,7 @@ class Resampler:
     def __init__(self, config: CameraConfig, picture_shape: tuple[int, int], lens: Lens | None):
         if lens is None and config.sensor_px_per_mm is None:
             raise CameraConfigError(
-                "the scale is not known: give camera.sensor_px_per_mm, or camera.lens_file "
+                "the scale is unknown: give camera.sensor_px_per_mm, or camera.lens_file "
                 "(`autospine camera --board PICTURES`)"
             )
         if lens is not None and lens.picture_shape != picture_shape:
@@ -196,7 +196,7 @@ class Resampler:
             rows, cols = config.shape
             raise CameraConfigError(
                 f"a slice of {rows * config.pixel_mm:g} x {cols * config.pixel_mm:g} mm does not "
-                "fit into the picture; make camera.shape smaller or raise the camera"
+                "fit in the picture; make camera.shape smaller or raise the camera"
             )
         self._where = np.moveaxis(where, -1, 0)
 

@@ -95,9 +95,9 @@ def _help(camera: BenchCamera, sharpness: Sharpness) -> str:
     if sharpness.overexposed > camera.config.most_overexposed:
         return "Overexposed: shorten the exposure or dim the light."
     if sharpness.circles != 1:
-        return f"{sharpness.circles} circles in view; one is wanted."
+        return f"{sharpness.circles} circles in view; exactly one is needed."
     if sharpness.focus < 0.3:
-        return "Soft edge: turn the lens until the focus is largest."
+        return "Soft edge: turn the lens until the focus value is highest."
     return "One sharp circle: good."
 
 

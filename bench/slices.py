@@ -99,7 +99,7 @@ class BenchCamera:
                 f"stages, or set camera.colour (now {self.config.colour})"
             )
         if count > 1:
-            return f"{count} circles in view: cover what is not the robot's"
+            return f"{count} circles in view: cover all but the robot's"
         return ""
 
     def _resampler_for(self, picture: Picture) -> Resampler:

@@ -129,8 +129,8 @@ class FrameSource:
                     found.append(exposure)
             elif time.monotonic() - last_s > self._stall_s:
                 raise CameraError(
-                    f"camera {self._source}: pictures come faster than this computer reads them; "
-                    "lower the camera's rate or resolution"
+                    f"camera {self._source}: pictures arrive faster than this computer can read "
+                    "them; lower the camera's rate or resolution"
                 )
         return found
 
@@ -144,7 +144,7 @@ class FrameSource:
                 if picture is None:
                     break
                 self._take(picture, number, queue.is_empty(began_s, time.monotonic()))
-            problem = f"camera {self._source}: there are no more pictures"
+            problem = f"camera {self._source}: no more pictures"
         except CameraError as error:
             problem = str(error)
         except Exception as error:  # whatever a codec or a driver raises ends the camera, by name
@@ -209,7 +209,7 @@ def read_picture(path: Path) -> Picture:
     cv2 = require_opencv()
     picture = cv2.imread(str(path), cv2.IMREAD_COLOR)
     if picture is None:
-        raise CameraError(f"{path}: not a picture that can be read")
+        raise CameraError(f"{path}: not a readable picture")
     return np.asarray(picture[..., ::-1], dtype=np.uint8)
 
 
@@ -241,8 +241,8 @@ def _capture(source: str) -> Iterator[Any]:
     try:
         if not capture.isOpened():
             raise CameraError(
-                f"camera {source}: cannot be opened; check that it is there, that this user may "
-                "read it and that no other program has it"
+                f"camera {source}: cannot be opened; check that it exists, that this user may "
+                "read it and that no other program is using it"
             )
         yield capture
     finally:

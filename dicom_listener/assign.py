@@ -4,7 +4,7 @@ A slice is assigned to a hold only if all of this holds; one missing proof sets 
 
 1. Time. Its acquisition, by the scanner's clock and the worst case of the offset between the
    clocks, began after the hold had settled, and had ended before the hold did. Where the offset is
-   not known it waits.
+   not known, or would not be if the scanner's clock had been set unseen, it waits.
 2. Receipt. It was received before the hold ended. An acquisition ends before it is received, by
    our own clock: so its end is proved whatever the scanner's clock says, and a clock that was set
    back can never carry a slice into an earlier hold.
@@ -37,7 +37,7 @@ _MAY_BE_MISSING = (Reason.AFTER_INCOMPLETE_HOLD, Reason.RECEIVED_AFTER_HOLD)
 @dataclass(frozen=True)
 class AssignRules:
     guard_s: float = 0.05
-    late_limit_s: float = 120.0
+    late_limit_s: float = 300.0
     arrival_mode: bool = False
     position_tolerance_mm: float = 0.5
     direction_tolerance: float = 0.01
@@ -134,7 +134,7 @@ def assign(
     )
     if doubt is not None:
         return doubt
-    return _surplus(hold, known) or assigned
+    return _surplus(hold, known) or _if_set(slice_, hold, offset, rules) or assigned
 
 
 def _bound_by(known: Sequence[Known]) -> Binding | None:
@@ -188,6 +188,21 @@ def _by_time(
             )
         return hold, Assigned(hold.hold_id, interval.source, earliest_s, latest_s)
     return _outside(holds, earliest_s, latest_start_s, latest_s, rules.guard_s)
+
+
+def _if_set(slice_: Slice, hold: HoldWindow, offset: Offset, rules: AssignRules) -> Pending | None:
+    """It is of this hold only if nobody has set the scanner's clock since it was compared."""
+    if isinstance(offset, OffsetUnknown) or offset.low_if_set_s is None or rules.arrival_mode:
+        return None
+    assert slice_.interval is not None
+    if slice_.interval.start_s + offset.low_if_set_s >= hold.settled_at_s + rules.guard_s:
+        return None
+    return Pending(
+        Reason.CLOCK_UNKNOWN,
+        f"the clocks have not been compared since hold {hold.hold_id} settled, and the scanner's "
+        "clock may have been set: compare the clocks, or confirm the hold at which this "
+        "acquisition was made",
+    )
 
 
 def _outside(

@@ -12,13 +12,17 @@ the lower bound comes from what people did at this site:
 Where both are known, an acquisition must be good by both: one may be wrong without harm. With
 neither there are no bounds at all. What contradicts them stops assignment by time until somebody
 compares the clocks again; it never replaces them.
+
+A clock that is set forward after a comparison, by less than slices take to come, shows in nothing.
+With a comparison alone an acquisition is therefore sure to have begun only after the comparison, or
+after `late_limit_s` before it came, whichever is later, if that is earlier than its own time says.
 """
 
 from dataclasses import dataclass, replace
 
 from dicom_slice.times import AcquisitionInterval
 
-_LAGS_KEPT = 10
+LAGS_KEPT = 10
 _MUCH_SOONER_S = 0.5
 _LAGS_THAT_SHOW_A_HABIT = 5
 
@@ -39,9 +43,9 @@ class ClockRules:
     witnesses: slices that must agree before promptness alone is believed: slices that were held up
     do not come equally late.
     longest_acquisition_s: no acquisition that comes without its duration lasts longer.
-    late_limit_s: a slice that seems to come later than this shows a clock that was set back, or a
-    network that stood still, and nothing can tell which. So long after the clock was set a slice
-    may have been acquired before, however promptly slices come here: one may be held up.
+    late_limit_s: no slice comes later than this. One that seems to shows a clock that was set back,
+    or a network that stood still, and nothing can tell which.
+    unseen_steps: the clock may be set without anybody's knowing.
     comparison_valid_s: a comparison says nothing of a slice further away in time than this, unless
     the scanner says that its clock is synchronized (AcquisitionTimeSynchronized).
     drift_ppm: what a clock may run off by while its time service slews it (ntpd: 500 ppm).
@@ -52,7 +56,8 @@ class ClockRules:
     promptness: Promptness | None = None
     witnesses: int = 5
     longest_acquisition_s: float = 30.0
-    late_limit_s: float = 120.0
+    late_limit_s: float = 300.0
+    unseen_steps: bool = True
     comparison_valid_s: float = 3600.0
     jump_tolerance_s: float = 0.5
     drift_ppm: float = 500.0
@@ -80,10 +85,11 @@ class Comparison:
 
 @dataclass(frozen=True)
 class OffsetBounds:
-    """The offset lies in [low_s, high_s]."""
+    """The offset lies in [low_s, high_s]; not below low_if_set_s if the clock was set unseen."""
 
     low_s: float
     high_s: float
+    low_if_set_s: float | None = None
 
 
 @dataclass(frozen=True)
@@ -95,7 +101,8 @@ class OffsetUnknown:
 
 Offset = OffsetBounds | OffsetUnknown
 
-_WHAT_TO_DO = "compare the clocks, or confirm the hold at which this acquisition was made"
+_CONFIRM = "or confirm the hold at which this acquisition was made"
+_WHAT_TO_DO, _SCAN_AGAIN = f"compare the clocks, {_CONFIRM}", f"scan again, {_CONFIRM}"
 
 
 @dataclass(frozen=True)
@@ -115,6 +122,10 @@ class Received:
         """Receipt less the latest end: the offset plus the least delay."""
         return self.received_s - latest_end_s(self.interval, rules)
 
+    def earliest_start_s(self, rules: ClockRules) -> float:
+        """By our clock, whatever the scanner's says: no slice comes later than `late_limit_s`."""
+        return self.interval.start_s + self.least_lag_s(rules) - rules.late_limit_s
+
 
 @dataclass(frozen=True)
 class ScannerClock:
@@ -126,6 +137,7 @@ class ScannerClock:
     known; suspicion: what they make doubtful of it. Both stand until the next comparison.
     least_lags (lag by the latest end, whether that is certain) and upper_s (the least lag by the
     earliest end): over all slices since then. lags_s: of the last ones whose ends are certain.
+    synchronized_since_s: since when all slices say that the clock is synchronized.
     """
 
     comparisons: tuple[Comparison, ...] = ()
@@ -135,6 +147,7 @@ class ScannerClock:
     least_lags: tuple[tuple[float, bool], ...] = ()
     upper_s: float | None = None
     lags_s: tuple[float, ...] = ()
+    synchronized_since_s: float | None = None
 
     def compared(self, made: Comparison, rules: ClockRules) -> "ScannerClock":
         """What is known once the clocks have been compared (again).
@@ -151,22 +164,31 @@ class ScannerClock:
         against = self.contradicted or self.suspicion
         if against:
             return OffsetUnknown(f"{against}: {_WHAT_TO_DO}")
-        if self.set_at_s is not None and slice_.received_s < self.set_at_s + rules.late_limit_s:
+        if self.set_at_s is not None and slice_.earliest_start_s(rules) < self.set_at_s:
             return OffsetUnknown(
-                "it may have been acquired before the scanner's clock was set: scan again, or "
-                "confirm the hold at which this acquisition was made"
+                f"it may have been acquired before the scanner's clock was set: {_SCAN_AGAIN}"
             )
         compared = self.by_comparison(slice_, rules)
         if compared is not None and _ahead_s(slice_, compared, rules) > rules.jump_tolerance_s:
             return OffsetUnknown(f"it arrived sooner than the comparison allows: {_WHAT_TO_DO}")
-        lows = [
-            bounds.low_s
-            for bounds in (compared, self._by_promptness(slice_, rules))
-            if bounds is not None
-        ]
+        # of a slice that comes later than any did when this was measured, promptness says nothing
+        unlike = _unlike_measured(self, slice_, rules)
+        prompt = None if unlike else self._by_promptness(slice_, rules)
+        lows = [bounds.low_s for bounds in (compared, prompt) if bounds is not None]
+        if not lows and unlike and self.is_witnessed(rules):
+            return OffsetUnknown(f"{unlike}: {_SCAN_AGAIN}")
         if not lows:
             return OffsetUnknown(f"{self._why_unknown(slice_, rules)}: {_WHAT_TO_DO}")
-        return OffsetBounds(min(lows), max(self._high_s(slice_, rules), min(lows)))
+        if_set = self._low_if_set_s(slice_, rules) if prompt is None else None
+        return OffsetBounds(min(lows), max(self._high_s(slice_, rules), min(lows)), if_set)
+
+    def _low_if_set_s(self, slice_: Received, rules: ClockRules) -> float | None:
+        """None: nobody sets this clock unseen, or what it follows is known since the comparison."""
+        since_s, last_s = self.synchronized_since_s, self.comparisons[-1].at_s
+        is_followed = slice_.synchronized and since_s is not None and since_s <= last_s
+        if not rules.unseen_steps or is_followed:
+            return None
+        return max(last_s, slice_.earliest_start_s(rules)) - slice_.interval.start_s
 
     def _high_s(self, slice_: Received, rules: ClockRules) -> float:
         compared = self.by_comparison(slice_, rules)
@@ -194,15 +216,20 @@ class ScannerClock:
         )
 
     def by_comparison(self, slice_: Received, rules: ClockRules) -> OffsetBounds | None:
-        """What the comparison says that was made nearest to this slice in time."""
-        if not self.comparisons:
-            return None
-        at_s = slice_.received_s
-        nearest = min(self.comparisons, key=lambda made: abs(at_s - made.at_s))
-        if not slice_.synchronized and abs(at_s - nearest.at_s) > rules.comparison_valid_s:
+        """What the comparisons say that were made while it was on its way, and before and after."""
+        at_s, sent_s = slice_.received_s, slice_.earliest_start_s(rules)
+        near: list[Comparison] = []
+        for made in self.comparisons:
+            near = [made] if made.at_s < sent_s else [*near, made]
+            if made.at_s > at_s:
+                break
+        if not slice_.synchronized:
+            near = [made for made in near if abs(at_s - made.at_s) <= rules.comparison_valid_s]
+        if not near:
             return None
         ppm = rules.synchronized_drift_ppm if slice_.synchronized else rules.drift_ppm
-        return nearest.bounds_at(at_s, ppm)
+        bounds = [made.bounds_at(at_s, ppm) for made in near]
+        return OffsetBounds(min(b.low_s for b in bounds), max(b.high_s for b in bounds))
 
     def _by_promptness(self, slice_: Received, rules: ClockRules) -> OffsetBounds | None:
         """Its own lag always counts: the clock may have gone forward since the other slices.
@@ -302,7 +329,7 @@ def _of_a_zone(ahead_s: float) -> str:
 
 def _break_of_habit(clock: ScannerClock, slice_: Received) -> str:
     """Slices that all came equally late, and one that did not: the clock may have gone forward."""
-    if len(clock.lags_s) < _LAGS_THAT_SHOW_A_HABIT or not _is_certain(slice_.interval):
+    if len(clock.lags_s) < _LAGS_THAT_SHOW_A_HABIT or not is_certain(slice_.interval):
         return ""
     least_s, most_s = min(clock.lags_s), max(clock.lags_s)
     sooner_s = least_s - slice_.most_lag_s
@@ -326,14 +353,17 @@ def _lateness(clock: ScannerClock, slice_: Received, rules: ClockRules) -> str:
 
 
 def _unlike_measured(clock: ScannerClock, slice_: Received, rules: ClockRules) -> str:
-    """A slice that comes later than any did when the site was commissioned."""
+    """A slice that comes later than any did when the site was commissioned.
+
+    Its promptness says nothing of it; and it may have been acquired before the clock was set.
+    """
     promptness, known = rules.promptness, clock.by_comparison(slice_, rules)
-    if promptness is None or not _is_certain(slice_.interval):
+    if promptness is None:
         return ""
     if known is not None:
-        delay_s = slice_.most_lag_s - known.high_s
+        delay_s = slice_.least_lag_s(rules) - known.high_s
     elif clock.upper_s is not None:
-        delay_s = slice_.most_lag_s - clock.upper_s + promptness.least_s
+        delay_s = slice_.least_lag_s(rules) - clock.upper_s + promptness.least_s
     else:
         return ""
     if delay_s <= promptness.most_s + rules.jump_tolerance_s:
@@ -345,7 +375,7 @@ def _unlike_measured(clock: ScannerClock, slice_: Received, rules: ClockRules) -
 
 
 def _with_lag(clock: ScannerClock, slice_: Received, rules: ClockRules) -> ScannerClock:
-    lag = slice_.least_lag_s(rules), _is_certain(slice_.interval)
+    lag = slice_.least_lag_s(rules), is_certain(slice_.interval)
     upper_s = slice_.most_lag_s
     if clock.upper_s is not None:
         upper_s = min(clock.upper_s, upper_s)
@@ -353,35 +383,16 @@ def _with_lag(clock: ScannerClock, slice_: Received, rules: ClockRules) -> Scann
         clock,
         least_lags=tuple(sorted((*clock.least_lags, lag)))[: rules.witnesses],
         upper_s=upper_s,
-        lags_s=(*clock.lags_s, lag[0])[-_LAGS_KEPT:] if lag[1] else clock.lags_s,
+        lags_s=(*clock.lags_s, lag[0])[-LAGS_KEPT:] if lag[1] else clock.lags_s,
+        synchronized_since_s=_synchronized_since_s(clock, slice_),
     )
 
 
-@dataclass(frozen=True)
-class Drift:
-    """The least lags at the beginning and of late, over `_LAGS_KEPT` slices with certain ends.
-
-    A clock that creeps shows in no single slice. Nor can it be told from slices that have come to
-    take longer; either way what everything rests on is no longer what it was.
-    """
-
-    first_s: tuple[float, ...] = ()
-    last_s: tuple[float, ...] = ()
-
-    def with_slice(self, slice_: Received) -> "Drift":
-        if not _is_certain(slice_.interval):
-            return self
-        lag_s = slice_.most_lag_s
-        if len(self.first_s) < _LAGS_KEPT:
-            return Drift((*self.first_s, lag_s))
-        return Drift(self.first_s, (*self.last_s, lag_s)[-_LAGS_KEPT:])
-
-    @property
-    def moved_s(self) -> float:
-        """How much longer the lags have become; 0 until there are enough slices to say."""
-        if len(self.last_s) < _LAGS_KEPT:
-            return 0.0
-        return min(self.last_s) - min(self.first_s)
+def _synchronized_since_s(clock: ScannerClock, slice_: Received) -> float | None:
+    if not slice_.synchronized:
+        return None
+    since_s = clock.synchronized_since_s
+    return slice_.received_s if since_s is None else since_s
 
 
 def earliest_end_s(interval: AcquisitionInterval) -> float:
@@ -398,5 +409,6 @@ def latest_end_s(interval: AcquisitionInterval, rules: ClockRules) -> float:
     return interval.end_s
 
 
-def _is_certain(interval: AcquisitionInterval) -> bool:
+def is_certain(interval: AcquisitionInterval) -> bool:
+    """Whether the header says when it ended."""
     return interval.end_s is not None and not interval.estimated

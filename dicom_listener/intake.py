@@ -52,6 +52,7 @@ _HOLDS_LOOKED_AT = 64
 _EVENTS_AT_ONCE = 1000
 _KNOWN_AT_MOST = 1500
 _KNOWN_AFTER_PRUNING = 1000
+_WAITING_AT_MOST = 200
 
 log = structlog.get_logger("listener")
 
@@ -89,6 +90,7 @@ class Intake:
         self._known: dict[int, Known] = {}
         self._pending: dict[int, Slice] = {}
         self._clockless: set[int] = set()  # of those, the ones that wait for the clock to be known
+        self._is_flooded = False
         self._confirmed: set[int] = set()
         self._done: set[str] = set()
         self._seen_event_id = 0
@@ -152,6 +154,7 @@ class Intake:
             return
         self._seen_version = version
         self._read_events(replaying=False)
+        self._let_go()
         self._decide_pending()
 
     def take(self, path: Path) -> None:
@@ -189,7 +192,9 @@ class Intake:
         self._write(rows, slices, envelope)
         self._note_plan(path, rows, envelope)
         self._done.add(name)
-        self._decide_pending()
+        self._let_go()
+        if self._clocks.has_news:
+            self._decide_pending()
         self._metrics.intake_seconds.observe(max(0.0, time.time() - envelope.received_s))
 
     def set_aside(self, path: Path, text: str) -> None:
@@ -395,6 +400,32 @@ class Intake:
                 continue
             self._decide(row, decision, (state, hold_id, code, text))
 
+    def _let_go(self) -> None:
+        """Set aside what waits in vain, and the oldest of too many: a flood harms no other slice.
+
+        A person may still say of each that it is of a hold.
+        """
+        oldest_s = time.time() - self._rules.clock.comparison_valid_s
+        is_flood = len(self._pending) > _WAITING_AT_MOST
+        if is_flood and not self._is_flooded:
+            text = f"more than {_WAITING_AT_MOST} slices are pending: the oldest are set aside"
+            self.alarm("many_slices_wait", text)
+        self._is_flooded = is_flood or (self._is_flooded and bool(self._pending))
+        for slice_id in list(self._pending):
+            row = self._record.slice(slice_id)
+            if row.state != "pending":
+                self._follow(row)
+                continue
+            if len(self._pending) > _WAITING_AT_MOST:
+                why = f"more than {_WAITING_AT_MOST} slices were pending"
+            elif slice_id in self._clockless and row.received_s < oldest_s:
+                why = "it was pending too long: the clocks were not compared"
+            else:
+                return
+            text = f"{why} ({row.reason})"
+            decision = Quarantined(Reason(row.reason_code), text)
+            self._decide(row, decision, ("quarantined", None, row.reason_code, text))
+
     def _note_clockless(self, slice_id: int, code: str) -> None:
         waits = code == Reason.CLOCK_UNKNOWN
         (self._clockless.add if waits else self._clockless.discard)(slice_id)
@@ -417,6 +448,7 @@ class Intake:
         self._metrics.decided.labels(state, code).inc()
         if not isinstance(decision, Pending):
             slice_ = self._pending.pop(row.slice_id)
+            self._clockless.discard(row.slice_id)
             self._known[row.slice_id] = Known(slice_, row.received_s, hold_id, code)
             self._note_use(slice_, hold_id)
 

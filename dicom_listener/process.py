@@ -32,6 +32,7 @@ from room_config.listener import ListenerConfig
 from room_config.load import Config, ConfigError
 
 _POLL_S = 0.02
+_TAKING_S = 0.5
 _DISK_S = 10.0
 _REMOVAL_S = 600.0  # it reads every row
 _RECORD_RETRY_S = 1.0
@@ -96,6 +97,7 @@ def intake_rules(config: Config) -> IntakeRules:
             promptness=_promptness(listener),
             longest_acquisition_s=listener.longest_acquisition_s,
             late_limit_s=listener.late_limit_s,
+            unseen_steps=listener.clock_may_be_set,
             comparison_valid_s=60 * listener.comparison_valid_min,
         ),
         zone=_zone(listener.scanner_time_zone),
@@ -293,12 +295,15 @@ def _requeue(reception: Reception, received: "SimpleQueue[Path]") -> int:
 def _take_received(
     reception: Reception, received: "SimpleQueue[Path]", attempts: Attempts, presence: Presence
 ) -> None:
-    """Wait for at most one poll, then take whatever is there."""
+    """Wait for at most one poll, then take what is there; a flood does not stop the loop."""
+    until_s = time.monotonic() + _TAKING_S
     try:
         path = received.get(timeout=_POLL_S)
         while True:
             _take(reception, path, attempts)
             presence.beat()
+            if time.monotonic() > until_s:
+                return
             path = received.get_nowait()
     except Empty:
         return

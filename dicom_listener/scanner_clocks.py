@@ -1,16 +1,18 @@
 """What is known of the clocks of the scanners that send to us, by scanner."""
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from dicom_listener.clock import (
+    LAGS_KEPT,
     ClockRules,
     Comparison,
-    Drift,
     Offset,
     OffsetUnknown,
     Received,
     ScannerClock,
+    is_certain,
     observe,
 )
 from dicom_slice.header import Slice
@@ -19,6 +21,33 @@ _WHAT_TO_DO = {
     kind: "; compare the clocks"
     for kind in ("clock_jump", "late_or_clock_jump", "push_delay_unlike_measured", "clock_drift")
 }
+
+
+@dataclass(frozen=True)
+class Drift:
+    """The least lags at the beginning and of late, over `LAGS_KEPT` slices with certain ends.
+
+    A clock that creeps shows in no single slice. Nor can it be told from slices that have come to
+    take longer; either way what everything rests on is no longer what it was.
+    """
+
+    first_s: tuple[float, ...] = ()
+    last_s: tuple[float, ...] = ()
+
+    def with_slice(self, slice_: Received) -> "Drift":
+        if not is_certain(slice_.interval):
+            return self
+        lag_s = slice_.most_lag_s
+        if len(self.first_s) < LAGS_KEPT:
+            return Drift((*self.first_s, lag_s))
+        return Drift(self.first_s, (*self.last_s, lag_s)[-LAGS_KEPT:])
+
+    @property
+    def moved_s(self) -> float:
+        """How much longer the lags have become; 0 until there are enough slices to say."""
+        if len(self.last_s) < LAGS_KEPT:
+            return 0.0
+        return min(self.last_s) - min(self.first_s)
 
 
 class ScannerClocks:
@@ -104,6 +133,10 @@ class ScannerClocks:
         self._drifts.clear()
         self._standing.clear()
         self._has_news = True
+
+    @property
+    def has_news(self) -> bool:
+        return self._has_news
 
     def take_news(self) -> bool:
         """Whether slices that waited for the clock to be known are to be asked for again."""

@@ -60,6 +60,11 @@ class ImagingConfig(Section):
         gt=0,
         description="A fiducial farther than this from its predicted position is refused.",
     )
+    localization: Literal["template", "disc"] = Field(
+        default="template",
+        description="What is fitted to the fiducial once the calibration has shown it: its own "
+        "image, whatever its shape, or a disc.",
+    )
     point_spread: PointSpreadConfig | None = Field(
         default=None,
         description="The filter of the slices; absent: recognised for each series from the noise "

@@ -86,9 +86,10 @@ class ListenerConfig(Section):
         "slice is used only after the robot has stood still for that long.",
     )
     late_limit_s: float = Field(
-        default=120.0,
+        default=300.0,
         gt=0,
-        description="A slice that appears later than this is set aside: its clock may have jumped.",
+        description="No slice arrives later than this after its acquisition; one that appears to "
+        "is set aside: its clock may have jumped.",
     )
     clock_offset_s: float | None = Field(
         default=None, description="A comparison of the clocks: ours minus the scanner's."
@@ -107,6 +108,13 @@ class ListenerConfig(Section):
         description="How long a comparison of the clocks is valid; after that slices are pending "
         "until the clocks are compared again. A scanner that states that its clock is "
         "synchronized is exempt.",
+    )
+    clock_may_be_set: bool = Field(
+        default=True,
+        description="True: the scanner's clock may be set without the room being told. Where "
+        "prompt_delay_s was not measured, the clocks must then be compared at each hold, or each "
+        "acquisition confirmed. False: the clock is never set, and a comparison is valid for "
+        "comparison_valid_min.",
     )
     arrival_mode: bool = Field(
         default=False,

@@ -24,7 +24,7 @@ app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
 def scanner(
     config: Annotated[Path, typer.Option(help="The room's TOML file; its [virtual] table.")],
     exit_with_parent: Annotated[
-        bool, typer.Option(help="Stop when standard input is closed.")
+        bool, typer.Option(help="Exit when standard input is closed.")
     ] = False,
 ) -> None:
     """A virtual scanner: acquires what the service asks for and sends it by C-STORE.

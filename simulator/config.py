@@ -59,10 +59,10 @@ class Placement(_Table):
 
 
 class Fiducial(_Table):
-    """A sphere of vitamin E in a polymer shell."""
+    """Vitamin E in a polymer shell: a sphere, or an oval one that a cannula goes through."""
 
     name: Annotated[str, Field(min_length=1)] = "upper"
-    """By which the truth file calls it."""
+    """Its name in the truth file."""
     mount: Literal["top_stage", "guide"] = "top_stage"
     """`top_stage`: rides on it (2 DOF); `guide`: on the cannula between the ball joints (4 DOF)."""
     offset_mm: Vector = (0.0, 0.0, 0.0)
@@ -77,6 +77,24 @@ class Fiducial(_Table):
     """Of the oil."""
     shell_signal: Annotated[float, Field(ge=0)] = 0.0
     """Of the shell: printed polymer gives none."""
+    oval: Annotated[float, Field(ge=1, le=1.5)] = 1.0
+    """Longer over shorter diameter of a coronal section; 1: a sphere."""
+    oval_deg: Annotated[float, Field(ge=0, lt=180)] = 30.0
+    """Direction of the longer one, from the image's rows towards its columns."""
+    cannula_mm: Annotated[float, Field(ge=0)] = 0.0
+    """Diameter of the void that a cannula through the fiducial, along the slice normal, leaves; 0:
+    none."""
+
+    @model_validator(mode="after")
+    def _cannula_fits(self) -> "Fiducial":
+        if not self.cannula_mm < 2 * self.radius_mm / self.oval**0.5:
+            raise ValueError("cannula_mm leaves nothing of the fiducial")
+        return self
+
+
+FiducialKind = Literal["cannulated", "sphere"]
+CANNULATED = {"oval": 1.06, "cannula_mm": 4.0}
+"""What a printed fiducial that sits on a needle guide of brass is like, beside a plain sphere."""
 
 
 class StaticObject(_Table):
@@ -163,9 +181,9 @@ class SliceProtocol(_Table):
     chemical_shift_ppm: Annotated[float, Field(ge=0)] = 0.0
     """Oil against water: 3.4 in a real room; 0 leaves the fiducial where it is."""
     echo_time_ms: Positive = 0.9
-    """As the header says it."""
+    """As stated in the header."""
     flip_angle_deg: Positive = 12.0
-    """As the header says it."""
+    """As stated in the header."""
 
 
 class ScannerSettings(_Table):
@@ -175,9 +193,9 @@ class ScannerSettings(_Table):
     """Address of the service, which says what to acquire next."""
     token_file: str = ""
     """File with the token that the service asks for; relative to the configuration. The environment
-    variable AUTOSPINE_TOKEN goes before it. Empty: the service asks for none."""
+    variable AUTOSPINE_TOKEN overrides it. Empty: the service asks for none."""
     listener_host: str = "127.0.0.1"
-    """Where slices are sent to."""
+    """Where slices are sent."""
     listener_port: Port
     """DICOM port of the listener."""
     listener_ae_title: AeTitle = "AUTOSPINE"
@@ -185,24 +203,24 @@ class ScannerSettings(_Table):
     ae_title: AeTitle = "VIRTUALMR"
     """Calling AE title, and the station's name."""
     motors_truth_host: str = "127.0.0.1"
-    """Where the emulated motors tell the truth about the stages."""
+    """Where the emulated motors report the true stage positions."""
     motors_truth_port: Port
-    """Port of that."""
+    """Its port."""
     truth_file: str
     """JSON lines, appended: the truth of each acquisition. Relative to the configuration."""
     faults_file: str = ""
-    """File with the names of faults that befall every acquisition while they stand there, one a
-    line; read anew each time. Relative to the configuration. Empty: only the room's `faults`."""
+    """File with the names of faults that affect every acquisition while listed, one per line; read
+    again each time. Relative to the configuration. Empty: only the room's `faults`."""
     acquisition_s: Positive = 0.25
-    """How long a slice takes."""
+    """Duration of an acquisition."""
     gap_s: Annotated[float, Field(ge=0)] = 0.02
     """Between two slices of one request."""
     reconstruction_s: Annotated[float, Field(ge=0)] = 0.15
     """From the end of an acquisition until its slice is sent."""
     poll_s: Positive = 0.05
-    """How often the operator looks at what to acquire."""
+    """How often the operator checks what to acquire."""
     retry_s: Positive = 0.5
-    """From a failed delivery until the next attempt."""
+    """Wait after a failed delivery before the next attempt."""
     retries: Annotated[int, Field(ge=0)] = 120
     """Attempts after the first."""
     clock_offset_s: float = 37.2
@@ -210,7 +228,7 @@ class ScannerSettings(_Table):
     clock_drift_ppm: float = 0.0
     """How much faster the scanner's clock runs than ours."""
     utc_offset_min: Annotated[int, Field(ge=-14 * 60, le=14 * 60)] = 0
-    """The scanner writes local time: so many minutes ahead of UTC."""
+    """The scanner writes local time, this many minutes ahead of UTC."""
     write_timezone: bool = True
     """Whether the header says so (TimezoneOffsetFromUTC)."""
     time_attributes: Literal["datetime", "date_and_time", "both"] = "both"
@@ -218,9 +236,9 @@ class ScannerSettings(_Table):
     sop_class: Literal["classic", "enhanced"] = "classic"
     """MR Image or Enhanced MR Image."""
     manufacturer: str = "AutoSPINe Virtual MR"
-    """As the header says it."""
+    """As stated in the header."""
     model_name: str = "Virtual 3T"
-    """As the header says it."""
+    """As stated in the header."""
 
 
 class VirtualRoom(_Table):
@@ -239,9 +257,9 @@ class VirtualRoom(_Table):
     scanner: ScannerSettings | None = None
     """The scanner as a process; not needed for studies."""
     faults: tuple[str, ...] = ()
-    """Names of what goes wrong."""
+    """Names of the faults."""
     fault_probability: Annotated[float, Field(ge=0, le=1)] = 0.3
-    """That each of them befalls an acquisition."""
+    """Probability that each of them affects an acquisition."""
     motors: dict[str, Any] = {}
     """Not read here: the emulated motor controllers check their own table."""
 
@@ -249,7 +267,7 @@ class VirtualRoom(_Table):
     def _names_are_known_and_unique(self) -> "VirtualRoom":
         for name in self.faults:
             if name not in FAULTS:
-                raise ValueError(f"no fault is called {name!r}; there are: {', '.join(FAULTS)}")
+                raise ValueError(f"unknown fault {name!r}; known: {', '.join(FAULTS)}")
         names = [fiducial.name for fiducial in self.fiducials]
         if len(set(names)) != len(names):
             raise ValueError("two fiducials have the same name")

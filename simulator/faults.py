@@ -16,12 +16,12 @@ FAULTS = MappingProxyType(
         "late": "the slice arrives 2 to 4 s after its reconstruction",
         "duplicate": "the same slice is sent twice, byte for byte",
         "out_of_order": "the slice is held back until after the next one has been sent",
-        "missing": "the slice is acquired and never sent",
-        "corrupted": "the pixel data are cut short, or a block of them is overwritten",
+        "missing": "the slice is acquired but never sent",
+        "corrupted": "the pixel data are truncated, or a block of them is overwritten",
         "wrong_orientation": "the operator acquires an axial slice instead",
         "clock_jump": "the scanner's clock jumps once, by 5 s to 1 h, forward or back",
-        "extra_series": "a localizer, a phase image and a distortion-corrected twin come with it",
-        "motion_during_scan": "an acquisition that nobody asked for runs while the robot moves",
+        "extra_series": "a localizer, a phase image and a distortion-corrected copy come with it",
+        "motion_during_scan": "an unrequested acquisition runs while the robot moves",
     }
 )
 

@@ -44,7 +44,7 @@ def _why_not(line: dict[str, Any] | None, hold_id: int) -> str:
     if line["kind"] == "extra":
         return f"it belongs to an extra series ({line['image_type']})"
     if line["hold_id"] is None:
-        return "nobody asked for it"
+        return "nobody requested it"
     if line["hold_id"] != hold_id:
         return f"it was acquired for hold {line['hold_id']}"
     if not line["travel_mm"] <= _STANDING_MM:

@@ -205,7 +205,17 @@ def _fiducial_at_origin(
 ) -> Floats:
     grid = (geometry.shape, geometry.spacing_mm)
     slab = (round(1000 * offset_mm), protocol.thickness_mm)
-    oil = fiducial.signal * phantom.sphere_spectrum(*grid, fiducial.radius_mm, *slab)
+    if fiducial.oval == 1:
+        unit = phantom.sphere_spectrum(*grid, fiducial.radius_mm, *slab)
+    else:
+        oval = (fiducial.oval, fiducial.oval_deg)
+        unit = phantom.oval_spectrum(*grid, fiducial.radius_mm, oval, *slab)
+    if fiducial.cannula_mm > 0:
+        share = phantom.bored_share(
+            fiducial.radius_mm, fiducial.cannula_mm, offset_mm, protocol.thickness_mm
+        )
+        unit = unit - share * phantom.circle_spectrum(*grid, fiducial.cannula_mm / 2)
+    oil = fiducial.signal * unit
     if fiducial.shell_signal == 0 or fiducial.shell_mm == 0:
         return oil
     outer = phantom.sphere_spectrum(*grid, fiducial.radius_mm + fiducial.shell_mm, *slab)

@@ -179,12 +179,12 @@ def _associate(settings: Route, sop_classes: Sequence[str]) -> Association:
 
 def _store(association: Association, push: Push) -> tuple[int | None, str]:
     if not association.is_established:
-        return None, "no association: refused, aborted or nobody there"
+        return None, "no association: refused, aborted or no response"
     try:
         status = association.send_c_store(push.dataset)
     except (ValueError, RuntimeError) as error:
         return None, str(error)
     if "Status" not in status:
-        return None, "the receiver gave no answer"
+        return None, "the receiver did not answer"
     comment = status.get("ErrorComment", "")
     return int(status.Status), f"status 0x{int(status.Status):04X} {comment}".strip()

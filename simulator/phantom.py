@@ -41,6 +41,38 @@ def sphere_spectrum(
 
 
 @lru_cache(maxsize=64)
+def oval_spectrum(
+    shape: Shape,
+    spacing_mm: Spacing,
+    radius_mm: float,
+    oval: tuple[float, float],
+    offset_um: int,
+    thickness_mm: float,
+) -> Floats:
+    """As `sphere_spectrum`, of a sphere stretched in the plane at constant area.
+
+    oval: longer over shorter diameter, and the longer one's angle (deg) from rows to columns.
+    """
+    stretch, angle = np.sqrt(oval[0]), np.radians(oval[1])
+    k_row, k_col = frequencies(shape, spacing_mm)
+    along = (np.cos(angle) * k_row + np.sin(angle) * k_col) * stretch
+    across = (np.cos(angle) * k_col - np.sin(angle) * k_row) / stretch
+    slab_mm = (offset_um / 1000, thickness_mm)
+    full = sphere_slab_spectrum(np.hypot(along, across), radius_mm, slab_mm)
+    full.setflags(write=False)
+    return full
+
+
+def bored_share(radius_mm: float, bore_mm: float, offset_mm: float, thickness_mm: float) -> float:
+    """How much of a slab's thickness lies inside of a sphere, along a bore through its middle.
+
+    The bore's ends are taken for flat.
+    """
+    depth_mm = 2 * np.sqrt(max(radius_mm**2 - (bore_mm / 2) ** 2, 0.0))
+    return _overlap(offset_mm, float(depth_mm), thickness_mm)
+
+
+@lru_cache(maxsize=64)
 def circle_spectrum(shape: Shape, spacing_mm: Spacing, radius_mm: float) -> Floats:
     """A unit disc."""
     return _unfold(disc_spectrum(_quadrant(shape, spacing_mm), radius_mm), shape)

@@ -158,7 +158,7 @@ class VirtualScanner:
         except TruthError as error:
             if self._last_stage_mm is None:
                 raise
-            self._note(f"{error}; the stages are taken to stand where they stood")
+            self._note(f"{error}; the stages are assumed to be where they were")
             return StagePath.standing(self._last_stage_mm)
         self._last_stage_mm = path.at(ended_s)
         return path

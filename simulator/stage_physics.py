@@ -46,7 +46,7 @@ class StageParameters:
 
     def __post_init__(self) -> None:
         if self.mounting not in (1, -1):
-            raise ValueError(f"mounting {self.mounting} is neither 1 nor -1")
+            raise ValueError(f"mounting {self.mounting} is not 1 or -1")
         for name, low, high in _BOUNDS:
             value = getattr(self, name)
             if not low <= value <= high:

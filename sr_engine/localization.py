@@ -21,6 +21,9 @@ class Localization:
     residuals_px: (N, 2), what each frame's centre less its shift differs by from centre_px.
     chi2_per_dof: of the residuals against their covariances (2N - 2 degrees of freedom); for one
       frame, of its pixels against the model.
+    psf: point spread of the fit; None where the object's own image was fitted.
+    systematic_px: std (row, col) of what is common to all poses, beside covariance_px2: it cancels
+      between places seen by the same method, and counts where the centre itself does.
     """
 
     centre_px: Array
@@ -34,7 +37,8 @@ class Localization:
     n_frames: int
     method: str
     residuals_px: Array
-    psf: Psf
+    psf: Psf | None
+    systematic_px: Array | None = None
 
     @property
     def sigma_px(self) -> Array:

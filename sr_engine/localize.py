@@ -6,8 +6,9 @@ orthogonal to all that a frame has of its own. What is left over, frame by frame
 the frames agree with their shifts.
 """
 
+from collections.abc import Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -127,7 +128,8 @@ def localize(
         _refuse_doubtful(fit, begin, frame.shape)
         fits.append(fit)
         guess = (*(fit.centre_px - shift), fit.radius_px)
-    result = _combine(fits, shifts, psf, shift_sigma_px)
+    radius = float(np.mean([fit.radius_px for fit in fits]))
+    result = combined(fits, shifts, radius, shift_sigma_px, psf=psf)
     _refuse_outside_gate(result.centre_px, start, gate_px)
     return result
 
@@ -304,7 +306,39 @@ def _refuse_doubtful(
     )
 
 
-def _combine(fits: list[DiscFit], shifts: Array, psf: Psf, shift_sigma_px: float) -> Localization:
+class FrameFit(Protocol):
+    """What a fit says of one frame."""
+
+    @property
+    def centre_px(self) -> Array: ...
+    @property
+    def covariance_px2(self) -> Array: ...
+    @property
+    def amplitude(self) -> float: ...
+    @property
+    def background(self) -> float: ...
+    @property
+    def snr(self) -> float: ...
+    @property
+    def sigma(self) -> float: ...
+    @property
+    def chi2_per_dof(self) -> float: ...
+
+
+def combined(
+    fits: Sequence[FrameFit],
+    shifts: Array,
+    radius_px: float,
+    shift_sigma_px: float,
+    *,
+    method: str = "ml",
+    psf: Psf | None = None,
+    systematic_px: Array | None = None,
+) -> Localization:
+    """One place from the fits of frames at known shifts (N, 2), each by its own covariance.
+
+    Raises InconsistentFramesError where they disagree with their shifts.
+    """
     centres = np.array([fit.centre_px for fit in fits]) - shifts
     jitter = np.eye(2) * shift_sigma_px**2
     covariances = np.array([fit.covariance_px2 for fit in fits]) + jitter
@@ -318,16 +352,17 @@ def _combine(fits: list[DiscFit], shifts: Array, psf: Psf, shift_sigma_px: float
     return Localization(
         centre_px=centre,
         covariance_px2=covariance,
-        radius_px=float(np.mean([fit.radius_px for fit in fits])),
+        radius_px=radius_px,
         amplitude=float(np.mean([fit.amplitude for fit in fits])),
         background=float(np.mean([fit.background for fit in fits])),
         snr=float(np.mean([fit.snr for fit in fits])),
         sigma=float(np.mean([fit.sigma for fit in fits])),
         chi2_per_dof=chi2_per_dof,
         n_frames=len(fits),
-        method="ml",
+        method=method,
         residuals_px=residuals,
         psf=psf,
+        systematic_px=systematic_px,
     )
 
 

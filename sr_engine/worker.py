@@ -9,13 +9,12 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import io
-import math
 import sqlite3
 import time
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, cast, get_args
+from typing import Any
 
 import numpy as np
 import structlog
@@ -27,74 +26,36 @@ from case_record.connection import json_text
 from case_record.presence import Presence, Sole
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Measurement, SliceRow
-from dicom_slice.geometry import SliceGeometry
 from dicom_slice.pixels import magnitude_pixels
 from dicom_slice.reasons import UnusableError
-from room_config.imaging import PointSpreadConfig
 from room_config.load import Config
-from sr_engine.checks import refuse_non_square
-from sr_engine.errors import (
-    EngineError,
-    ObjectAtBorderError,
-    OutsideGateError,
-    SingularShiftSetError,
-)
-from sr_engine.hough import HoughSettings
-from sr_engine.localization import Localization
-from sr_engine.localize import SEARCH_PX, localize
-from sr_engine.paper import PaperMethod, PaperSettings, localize_paper
+from sr_engine.errors import EngineError, SingularShiftSetError, TemplateError
 from sr_engine.psf import Psf
-from sr_engine.recognise import psf_of_noise
 from sr_engine.reconstruction.reconstruct import reconstruct
+from sr_engine.request import (
+    TEMPLATE,
+    Found,
+    PointSpreads,
+    UnusableSlicesError,
+    common_geometry,
+    describe_result,
+    is_at_position,
+    localize_request,
+)
+from sr_engine.views import Frames, Templates, View
 
 IMAGES = "images"
 ALIVE = "worker.alive"
 _RECORD_RETRY_S = 0.5
-_SAME_PLACE = 1e-6
-_SAME_SLICE_MM = 0.5
 log = structlog.get_logger()
 
 
-class UnusableSlicesError(Exception):
-    """The slices of a measurement do not belong together, or cannot be read."""
+@dataclass(frozen=True)
+class Known:
+    """What is worked out once for many measurements."""
 
-    def __init__(self, code: str, text: str) -> None:
-        super().__init__(text)
-        self.code = code
-
-
-@dataclass(frozen=True, eq=False)
-class Frames:
-    """What a measurement is made from: frames of one geometry, and their known shifts.
-
-    pixels: (N, rows, cols); shifts_px: (N, 2), displacement from the reference pose.
-    """
-
-    pixels: NDArray[np.float64]
-    shifts_px: NDArray[np.float64]
-    geometry: SliceGeometry
-    slices: tuple[SliceRow, ...]
-
-
-class PointSpreads:
-    """The point spread of any slices: the configured one, or recognised once for each series."""
-
-    def __init__(self, configured: PointSpreadConfig | None = None) -> None:
-        self._configured = None
-        if configured is not None:
-            self._configured = Psf(configured.kind, configured.parameters, configured.acquired)
-        self._recognised: dict[tuple[str, tuple[int, int]], Psf] = {}
-
-    def of(self, frames: Frames) -> Psf:
-        """Recognised in the noise of the first frame that is seen of a series."""
-        if self._configured is not None:
-            return self._configured
-        series = str(frames.slices[0].header.get("series_instance_uid", ""))
-        key = (series, frames.geometry.shape)
-        if key not in self._recognised:
-            psf = self._recognised[key] = psf_of_noise(frames.pixels[0])
-            log.info("point spread", series=series, kind=psf.kind, acquired=psf.acquired)
-        return self._recognised[key]
+    psfs: PointSpreads = field(default_factory=PointSpreads)
+    templates: Templates = field(default_factory=Templates)
 
 
 def serve(config: Config, should_stop: Callable[[], bool]) -> None:
@@ -104,7 +65,7 @@ def serve(config: Config, should_stop: Callable[[], bool]) -> None:
     CaseRecordError, which names it, where another worker serves this room.
     """
     cases = Cases(*config.room.folders)
-    psfs = PointSpreads(config.imaging.point_spread)
+    known = Known(PointSpreads(config.imaging.point_spread))
     with Sole(cases.home, "worker"), Presence(cases.home, "worker") as presence:
         told_s = 0.0
 
@@ -122,7 +83,7 @@ def serve(config: Config, should_stop: Callable[[], bool]) -> None:
             try:
                 case_dir = cases.open
                 if case_dir is not None:
-                    _work_on(case_dir, cases, config, psfs, alive)
+                    _work_on(case_dir, cases, config, known, alive)
             except (CaseRecordError, sqlite3.Error, OSError) as error:
                 log.error("the case record cannot be used", error=str(error))
                 time.sleep(_RECORD_RETRY_S)
@@ -132,21 +93,21 @@ def serve(config: Config, should_stop: Callable[[], bool]) -> None:
 
 
 def _work_on(
-    case_dir: Path, cases: Cases, config: Config, psfs: PointSpreads, alive: Callable[[], bool]
+    case_dir: Path, cases: Cases, config: Config, known: Known, alive: Callable[[], bool]
 ) -> None:
     """Answer the requests of one case for as long as it is the open one."""
     factor = config.worker.reconstruction_factor
     with CaseRecord(case_dir, create=True) as record, Attempts(case_dir, "worker") as attempts:
         while alive() and cases.open == case_dir:
             for request in record.requested_measurements():
-                attempt(record, request, factor, psfs, attempts)
+                attempt(record, request, factor, known, attempts)
 
 
 def attempt(
     record: CaseRecord,
     request: Measurement,
     factor: int,
-    psfs: PointSpreads,
+    known: Known,
     attempts: Attempts,
 ) -> None:
     """As `measure`, unless this request has ended the worker again and again."""
@@ -157,11 +118,11 @@ def attempt(
         attempts.forget(key)
         return
     with attempts.at(key):
-        measure(record, request, factor, psfs)
+        measure(record, request, factor, known)
 
 
 def measure(
-    record: CaseRecord, request: Measurement, factor: int, psfs: PointSpreads | None = None
+    record: CaseRecord, request: Measurement, factor: int, known: Known | None = None
 ) -> None:
     """Carry out one requested measurement and record its result, or why there is none.
 
@@ -170,9 +131,9 @@ def measure(
     number = request.measurement_id
     try:
         frames = gather_frames(record, request)
-        psf = (psfs or PointSpreads()).of(frames)
-        found = localize_request(frames, request.method, request.request, psf)
-        result = describe_result(frames, found)
+        known = known or Known()
+        psf = known.psfs.of(frames)
+        result = describe_result(frames, localize_as_asked(record, request, frames, psf, known))
         result["point_spread"] = asdict(psf)
         result |= _reconstruction(record.case_dir, number, frames, factor)
         json_text(result)  # NaN, or a value of no known type, is found here and not in the record
@@ -217,77 +178,56 @@ def gather_frames(record: CaseRecord, request: Measurement) -> Frames:
             slices.append(row)
     if not slices:
         raise UnusableSlicesError("no_slices", "no slice is assigned to the holds")
-    geometry = _common_geometry(slices)
+    geometry = common_geometry(slices)
     shifts_px = np.array(shifts_mm, dtype=float) / np.array(geometry.spacing_mm)
     return Frames(np.array(pixels), shifts_px, geometry, tuple(slices))
 
 
-def recorded_point_spread(result: Mapping[str, Any] | None) -> Psf | None:
-    """What a recorded measurement was made with; None where its record does not say."""
-    recorded = (result or {}).get("point_spread")
-    if recorded is None:
-        return None
-    return Psf(recorded["kind"], tuple(recorded["parameters"]), tuple(recorded["acquired"]))
-
-
-def is_at_position(row: SliceRow, slice_position_mm: float | None) -> bool:
-    """True if the middle of the slice is there along its normal; None is everywhere."""
-    if slice_position_mm is None:
-        return True
-    geometry = geometry_of(row.header)
-    return abs(float(geometry.normal @ geometry.position_mm) - slice_position_mm) <= _SAME_SLICE_MM
-
-
-def geometry_of(header: Mapping[str, Any]) -> SliceGeometry:
-    """Return the slice geometry from the header as the record keeps it."""
-    geometry = header["geometry"]
-    return SliceGeometry(
-        position_mm=tuple(geometry["position_mm"]),
-        row_direction=tuple(geometry["row_direction"]),
-        col_direction=tuple(geometry["col_direction"]),
-        spacing_mm=tuple(geometry["spacing_mm"]),
-        shape=tuple(geometry["shape"]),
+def frames_then(frames: Frames, row: Measurement) -> Frames:
+    """Only the slices that were there then: more may have been taken at the same hold later."""
+    used = (row.result or {}).get("slice_ids")
+    if used is None:
+        until_s = np.inf if row.finished_s is None else row.finished_s
+        used = [one.slice_id for one in frames.slices if one.received_s <= until_s]
+    then = [number for number, one in enumerate(frames.slices) if one.slice_id in used]
+    if not then:
+        raise UnusableSlicesError("no_slices", "the slices of this measurement are not assigned")
+    return replace(
+        frames,
+        pixels=frames.pixels[then],
+        shifts_px=frames.shifts_px[then],
+        slices=tuple(frames.slices[number] for number in then),
     )
 
 
-def describe_result(frames: Frames, found: Localization) -> dict[str, Any]:
-    """Return what the record keeps of a localization, JSON-ready; see `case_record.rows`."""
-    geometry = frames.geometry
-    spacing = np.array(geometry.spacing_mm)
-    covariance = np.asarray(found.covariance_px2)
-    centre = np.asarray(found.centre_px)
-    # the newest slice is what the page shows: say where the fiducial is in that one
-    shown_px = centre + frames.shifts_px[-1]
-    return {
-        "slice_id": frames.slices[-1].slice_id,
-        "slice_ids": [row.slice_id for row in frames.slices],
-        "centre_px": shown_px.tolist(),
-        "reference_px": centre.tolist(),
-        "sigma_px": np.sqrt(np.diag(covariance)).tolist(),
-        "covariance_px2": covariance.tolist(),
-        "radius_px": float(found.radius_px),
-        "snr": float(found.snr),
-        "chi2_per_dof": float(found.chi2_per_dof),
-        "residuals_px": np.asarray(found.residuals_px).tolist(),
-        "method": found.method,
-        "n_frames": int(found.n_frames),
-        "patient_mm": geometry.patient_from_pixel(centre).tolist(),
-        "plane_mm": (_plane_origin_mm(geometry) + centre * spacing).tolist(),
-        "covariance_mm2": (covariance * np.outer(spacing, spacing)).tolist(),
-        "plane": {
-            "row_direction": list(geometry.row_direction),
-            "col_direction": list(geometry.col_direction),
-            "spacing_mm": list(geometry.spacing_mm),
-        },
-        "scan_s": sum(_scan_s(row.header) for row in frames.slices),
-    }
+def localize_as_asked(
+    record: CaseRecord,
+    request: Measurement,
+    frames: Frames,
+    psf: Psf,
+    known: Known,
+    method: str | None = None,
+) -> Found:
+    """The answer to a request, or what another method says of its frames."""
+    method = method or request.method
+    ids = request.request.get(TEMPLATE, ()) if method == TEMPLATE else ()
+    views = [_view(record, number) for number in ids]
+    return localize_request(frames, method, request.request, psf, views, known.templates)
 
 
-def _scan_s(header: Mapping[str, Any]) -> float:
-    """How long the scanner took for this slice, by its own clock; 0 where it does not say."""
-    interval = header.get("interval") or {}
-    start_s, end_s = interval.get("start_s"), interval.get("end_s")
-    return 0.0 if start_s is None or end_s is None else float(end_s - start_s)
+def _view(record: CaseRecord, number: int) -> View:
+    """An earlier measurement as a template is learnt from it: by the record, now and later."""
+    row = record.measurement(number)
+    if row.result is None:
+        raise TemplateError(f"measurement {number}, of which the template is learnt, has no result")
+    frames = frames_then(gather_frames(record, row), row)
+    if len(frames.slices) != len(row.result["slice_ids"]):
+        raise UnusableSlicesError(
+            "no_slices",
+            f"a slice of measurement {number}, of which the template is learnt, was set aside "
+            "since: calibrate again",
+        )
+    return View(number, frames, np.array(row.result["reference_px"]))
 
 
 def _code_of(error: EngineError | UnusableSlicesError | UnusableError) -> str:
@@ -296,123 +236,6 @@ def _code_of(error: EngineError | UnusableSlicesError | UnusableError) -> str:
     if isinstance(error, UnusableError):
         return str(error.reason.code)
     return str(error.reason)
-
-
-def localize_request(
-    frames: Frames, method: str, request: Mapping[str, Any], psf: Psf | None = None
-) -> Localization:
-    """Localize the fiducial where it is expected, or anywhere if nothing is known of its place.
-
-    request: radius_mm (low, high); expected_plane_mm and gate_mm (both None: not known);
-    region_px (r0, c0, r1, c1), where to look then (None: the whole slice); shift_sigma_mm
-    (standard deviation of a commanded shift, one axis). Raises an EngineError.
-    """
-    refuse_non_square(frames.geometry.spacing_mm)
-    spacing = np.array(frames.geometry.spacing_mm)
-    mean_mm = float(np.mean(spacing))
-    low_mm, high_mm = request["radius_mm"]
-    radius_px = (low_mm / mean_mm, high_mm / mean_mm)
-    if request["expected_plane_mm"] is None:
-        start_px = _start_anywhere(frames, method, radius_px, request.get("region_px"))
-        return _localize_by(method, frames, start_px, radius_px, request, psf)
-    expected_mm = np.array(request["expected_plane_mm"])
-    expected_px = (expected_mm - _plane_origin_mm(frames.geometry)) / spacing
-    gate_px = float(request["gate_mm"]) / mean_mm
-    start_px = expected_px
-    if gate_px > SEARCH_PX:  # the engine looks no further than that from a start
-        reach = gate_px + 2 * radius_px[1]
-        region = (*(expected_px - reach), *(expected_px + reach))
-        start_px = _start_in_region(frames, radius_px, region)
-    found = _localize_by(method, frames, start_px, radius_px, request, psf)
-    miss_px = float(np.linalg.norm(np.asarray(found.centre_px) - expected_px))
-    if not miss_px <= gate_px:
-        raise OutsideGateError(
-            f"the round object found is {miss_px * mean_mm:.1f} mm from where the fiducial is "
-            f"expected (limit {gate_px * mean_mm:.1f} mm)"
-        )
-    return found
-
-
-def _localize_by(
-    method: str,
-    frames: Frames,
-    start_px: NDArray[np.float64] | None,
-    radius_px: tuple[float, float],
-    request: Mapping[str, Any],
-    psf: Psf | None,
-) -> Localization:
-    if method in get_args(PaperMethod):
-        return localize_paper(
-            frames.pixels,
-            frames.shifts_px,
-            cast(PaperMethod, method),
-            start_px=start_px,
-            settings=PaperSettings(HoughSettings(radius_px)),
-        )
-    mean_mm = float(np.mean(frames.geometry.spacing_mm))
-    return localize(
-        frames.pixels,
-        frames.shifts_px,
-        start_px=start_px,
-        radius_px=radius_px,
-        method=method,
-        psf=psf,
-        shift_sigma_px=float(request.get("shift_sigma_mm", 0.0)) / mean_mm,
-    )
-
-
-def _start_anywhere(
-    frames: Frames,
-    method: str,
-    radius_px: tuple[float, float],
-    region_px: Sequence[float] | None,
-) -> NDArray[np.float64] | None:
-    """None where the method's own search over the whole slice serves."""
-    if region_px is not None:
-        return _start_in_region(frames, radius_px, region_px)
-    if method in get_args(PaperMethod):  # a circle transform takes any edge that is round
-        rows, cols = frames.geometry.shape
-        return _start_in_region(frames, radius_px, (0, 0, rows, cols))
-    return None
-
-
-def _start_in_region(
-    frames: Frames, radius_px: tuple[float, float], region_px: Sequence[float]
-) -> NDArray[np.float64]:
-    """The one round object of the first frame that lies in the region, in the reference pose."""
-    rows, cols = frames.geometry.shape
-    r0, c0 = (max(0, math.floor(value)) for value in region_px[:2])
-    r1, c1 = min(rows, math.ceil(region_px[2]) + 1), min(cols, math.ceil(region_px[3]) + 1)
-    if r1 <= r0 or c1 <= c0:
-        raise ObjectAtBorderError(
-            f"rows {r0} to {r1}, columns {c0} to {c1}, where the fiducial is looked for, lie "
-            f"outside of the {rows} x {cols} slice"
-        )
-    found = localize(frames.pixels[0, r0:r1, c0:c1], radius_px=radius_px)
-    return np.asarray(found.centre_px) + np.array([r0, c0]) - frames.shifts_px[0]
-
-
-def _plane_origin_mm(geometry: SliceGeometry) -> NDArray[np.float64]:
-    """Projections of the centre of pixel (0, 0) onto row and column direction, mm."""
-    position = np.array(geometry.position_mm)
-    return np.array([position @ geometry.row_direction, position @ geometry.col_direction])
-
-
-def _common_geometry(slices: list[SliceRow]) -> SliceGeometry:
-    first = geometry_of(slices[0].header)
-    for row in slices[1:]:
-        other = geometry_of(row.header)
-        same = other.shape == first.shape and all(
-            np.allclose(getattr(other, name), getattr(first, name), atol=_SAME_PLACE)
-            for name in ("position_mm", "row_direction", "col_direction", "spacing_mm")
-        )
-        if not same:
-            raise UnusableSlicesError(
-                "geometry_changed",
-                f"slice {row.sop_instance_uid} is not at the same position as slice "
-                f"{slices[0].sop_instance_uid} of the same measurement",
-            )
-    return first
 
 
 def _reconstruction(case_dir: Path, number: int, frames: Frames, factor: int) -> dict[str, Any]:

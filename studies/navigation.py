@@ -18,12 +18,13 @@ from service.procedure.sensing import ProcedureFailedError, ValidationGate, move
 from service.procedure.steps import MoveTo, ProcedureSteps
 from service.procedure.strategies import STRATEGIES
 from simulator.camera import Camera
-from simulator.config import SliceProtocol, VirtualRoom
+from simulator.config import CANNULATED, Fiducial, FiducialKind, SliceProtocol, VirtualRoom
 from simulator.stage_physics import StageParameters
 from studies.offline_room import CameraImaging, MrImaging, OfflineRoom
 
 Array = NDArray[np.float64]
 Setup = Literal["benchtop", "mri"]
+FIDUCIALS: dict[FiducialKind, dict[str, float]] = {"sphere": {}, "cannulated": CANNULATED}
 
 AXES = ("xt", "yt")
 TRAVEL_UM = 20_000
@@ -89,7 +90,10 @@ ASSUMPTIONS: dict[str, str] = {
 
 @dataclass(frozen=True)
 class Group:
-    """One room, one calibration, one target, some punctures of one strategy. Picklable."""
+    """One room, one calibration, one target, some punctures of one strategy. Picklable.
+
+    fiducial: of the scanner's room; adaptive steers by its image there, on the bench by a disc.
+    """
 
     setup: Setup
     strategy: str
@@ -97,6 +101,8 @@ class Group:
     punctures: int = GROUP
     snr: float = SNR
     step_scatter: float = STEP_SCATTER
+    fiducial: FiducialKind = "sphere"
+    encoders: bool = False
 
 
 @dataclass(frozen=True)
@@ -199,12 +205,13 @@ def _go_away(
 
 def _room(group: Group) -> OfflineRoom:
     seconds = IMAGE_MINUTES[group.setup] * 60.0
-    room = VirtualRoom(protocol=SliceProtocol(snr=group.snr))
+    fiducial = Fiducial.model_validate(FIDUCIALS[group.fiducial])
+    room = VirtualRoom(protocol=SliceProtocol(snr=group.snr), fiducials=(fiducial,))
     imaging: MrImaging | CameraImaging = MrImaging(room, frame_s=seconds)
     if group.setup == "benchtop":
         camera = Camera(noise=Camera().contrast / group.snr)
         imaging = CameraImaging(room, camera, frame_s=seconds)
-    stages = StageParameters(scatter=group.step_scatter)
+    stages = StageParameters(scatter=group.step_scatter, has_encoder=group.encoders)
     return OfflineRoom(imaging, stages, group.seed, region_px=REGION_PX)
 
 
@@ -216,6 +223,7 @@ def _calibration_arguments(group: Group) -> CalibrationArguments:
         shifts_px=((0.0, 0.0),),
         gate=_gate(group),
         method="ml" if STRATEGIES[group.strategy].fuses else "base",
+        localization="template" if group.setup == "mri" else "disc",
     )
 
 
@@ -237,6 +245,8 @@ def _approach_arguments(group: Group, target_mm: Array, number: int) -> Approach
 
 def _gate(group: Group) -> ValidationGate:
     """What the procedures are told of the motors: half as much again as is true of the scatter."""
+    if group.encoders:
+        return ValidationGate(3.0, 5.0, repeatability_mm=0.002, scale_error=0.0005)
     return ValidationGate(
         position_gate_mm=3.0,
         gate_sigma=5.0,

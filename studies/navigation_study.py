@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import stats
 
+from simulator.config import FiducialKind
 from studies.cluster import Mapper
 from studies.navigation import GROUP, Group, GroupResult, Puncture, Setup, run_group
 
@@ -77,7 +78,14 @@ class NavigationStudy:
 
 
 def groups_of(
-    setup: Setup, punctures: int, seed: int, snr: float, step_scatter: float
+    setup: Setup,
+    punctures: int,
+    seed: int,
+    snr: float,
+    step_scatter: float,
+    fiducial: FiducialKind = "sphere",
+    *,
+    encoders: bool = False,
 ) -> list[Group]:
     """The same rooms, random points and noise seeds for every strategy; the last may be short."""
     sizes = [GROUP] * (punctures // GROUP)
@@ -86,7 +94,7 @@ def groups_of(
     elif punctures % GROUP:
         sizes[-1] += 1
     return [
-        Group(setup, strategy, seed * 10_000 + number, size, snr, step_scatter)
+        Group(setup, strategy, seed * 10_000 + number, size, snr, step_scatter, fiducial, encoders)
         for strategy in STRATEGY_NAMES
         for number, size in enumerate(sizes)
     ]

@@ -83,7 +83,7 @@ def print_tables(study: NumericalStudy, console: Console) -> None:
             f"{study.cells_base_worse_than_sr()}.",
             highlight=False,
         )
-    console.print("Not given in the paper, and taken here:")
+    console.print("Not given in the paper, assumed here:")
     for what, value in chosen_parameters(study.point).items():
         console.print(f"  {what}: {value}", highlight=False)
 

@@ -67,11 +67,11 @@ def chosen_parameters(point: StudyPoint) -> dict[str, str]:
         "blur": f"Gaussian, sigma {point.blur_sigma_px:g} px, before the scaling",
         "scaling": "5000 to 125 px, mean over 40 x 40 pixels",
         "noise": f"magnitude of two noisy channels (Rician), SNR {point.snr:g} before any filter",
-        "place": "row phase drawn anew each trial; column one high-resolution pixel on",
+        "place": "row phase drawn again in each trial; column one high-resolution pixel on",
         "circle finding": f"radii {low:g} to {high:g} px, sensitivity {point.sensitivity:g}, "
         "edge threshold by Otsu, within 3 px of a start known to 1 px",
         "shift set": (
-            "four points, random in ±1 px, anew each trial"
+            "four points, random in ±1 px, drawn again in each trial"
             if point.shift_set == "paper"
             else f"{point.shift_set}, the same each trial"
         ),

@@ -41,11 +41,13 @@ from simulator.scene import true_fiducial_mm
 from simulator.stage_physics import PiezoLegsStage, StageParameters
 from sr_engine.errors import EngineError
 from sr_engine.psf import Psf
-from sr_engine.worker import Frames, describe_result, localize_request
+from sr_engine.request import describe_result, localize_request
+from sr_engine.views import Frames, Templates, View
 
 Array = NDArray[np.float64]
 Result = TypeVar("Result")
 _DRIVE_HZ = 1000.0
+_CORRECTIONS, _CLOSE_UM = 6, 1.5
 
 
 @dataclass(frozen=True, eq=False)
@@ -137,7 +139,8 @@ def _true_plane_mm(room: VirtualRoom, stage_mm: Mapping[str, float]) -> Array:
 
 
 class OfflineRoom:
-    """Motors without encoders, as in the default room: a readback is the count of the steps sent.
+    """Without encoders, as in the default room, a readback is the count of the steps sent; with
+    them, what they read.
 
     region_px: (r0, c0, r1, c1), where the fiducial is looked for while its place is not known;
     answer: what the operator says to a question; confirms by default, and never rescans.
@@ -172,6 +175,8 @@ class OfflineRoom:
         self._answer = answer or _agree
         self._slices: dict[int, list[SeenSlice]] = {1: []}
         self._measurements = 0
+        self._views: dict[int, View] = {}
+        self._templates = Templates()
 
     @property
     def stage_mm(self) -> dict[str, float]:
@@ -217,11 +222,26 @@ class OfflineRoom:
             steps = change_um * self.nominal_mounting[axis] / self.nominal_step_um[axis]
             drive(self.stages[axis], steps)
             self.setpoints_um[axis] += change_um
+            if self.stages[axis].parameters.has_encoder and reached == 1.0:
+                self.setpoints_um[axis] = self._close_loop(axis, setpoint_um)
         hold_id = max(self._slices) + 1
         self._slices[hold_id] = []
         if reached < 1.0:
             return Moved("STOPPED", "stopped", "STOP", hold_id, dict(self.setpoints_um))
         return Moved("DONE", "", "", hold_id, dict(self.setpoints_um))
+
+    def _close_loop(self, axis: str, setpoint_um: int) -> int:
+        """Correct by what the encoder says; what it reads at the end."""
+        stage, mounting = self.stages[axis], self.nominal_mounting[axis]
+        read_um = 0.0
+        for _ in range(_CORRECTIONS):
+            read_um = mounting * (stage.read_encoder_um() or 0.0)
+            if abs(setpoint_um - read_um) <= _CLOSE_UM:
+                break
+            drive(stage, (setpoint_um - read_um) * mounting / self.nominal_step_um[axis])
+        else:
+            read_um = mounting * (stage.read_encoder_um() or 0.0)
+        return round(read_um)
 
     def _acquire(self, step: Acquire) -> Acquired:
         if step.fresh:
@@ -270,14 +290,19 @@ class OfflineRoom:
             geometry,
             tuple(one.row for one, _ in taken),
         )
+        views = [self._views[number] for number in step.template]
         try:
             request = measure_request(step, self._radius_mm, self._region_px)
-            found = localize_request(frames, step.method, request, self.imaging.psf)
+            found = localize_request(
+                frames, step.method, request, self.imaging.psf, views, self._templates
+            )
         except EngineError as error:
             return Measured(self._measurements, error.reason, str(error))
-        if step.method == "ml":
+        self._views[self._measurements] = View(self._measurements, frames, found.by.centre_px)
+        if found.by.method == "ml":
             doubt = np.eye(2) * self.imaging.model_sigma_px**2
-            found = replace(found, covariance_px2=found.covariance_px2 + doubt)
+            by = replace(found.by, covariance_px2=found.by.covariance_px2 + doubt)
+            found = replace(found, by=by)
         return measured_from_result(self._measurements, describe_result(frames, found))
 
 

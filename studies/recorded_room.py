@@ -31,7 +31,8 @@ from service.room.measuring import measure_request, measured_from_result
 from simulator.config import ScannerSettings
 from simulator.dicom_writer import AcquisitionStamp, Series, Study, write_mr_image
 from simulator.stage_physics import StageParameters
-from sr_engine.worker import is_at_position, measure
+from sr_engine.request import is_at_position
+from sr_engine.worker import Known, measure
 from studies.offline_room import MrImaging, OfflineRoom
 
 _MOVE_S, _SLICE_S = 1.0, 0.5
@@ -62,6 +63,7 @@ class RecordedRoom(OfflineRoom):
             motors_truth_port=1,
             truth_file="none",
         )
+        self._known = Known()
         self._study = Study.new(start_s)
         self._series = Series.new(1, "recorded", ("M", "ND"), start_s)
         (record.case_dir / _INBOX).mkdir(exist_ok=True)
@@ -179,7 +181,7 @@ class RecordedRoom(OfflineRoom):
         request = measure_request(step, self._radius_mm, self._region_px)
         hold_ids = [hold.hold_id for hold in step.holds]
         number = self.record.request_measurement(step.method, hold_ids, request)
-        measure(self.record, self.record.measurement(number), factor=2)
+        measure(self.record, self.record.measurement(number), 2, self._known)
         done = self.record.measurement(number)
         if done.result is None:
             return Measured(number, done.reason_code, done.reason)

@@ -1,11 +1,17 @@
-"""Which tests start processes: `make quick` leaves them out. Its folder is where every test finds
-`real_slices`."""
+"""Which tests start processes: `make quick` leaves them out, and they run first, so that no worker
+waits for the other's last long file. This folder is where every test finds `real_slices`.
+"""
 
 import re
 from functools import cache
 from pathlib import Path
 
 import pytest
+from hypothesis import HealthCheck, settings
+
+# How long an example takes says more about what else the machine is doing than about our code.
+settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("patient")
 
 _HERE = Path(__file__).parent
 _FIXTURES = {"shared_room", "stages", "receiver", "start", "demo", "client", "browser", "page"}
@@ -28,3 +34,4 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         fixtures = set(getattr(item, "fixturenames", ()))
         if fixtures & _FIXTURES or _starts_processes(item.path):
             item.add_marker("process")
+    items.sort(key=lambda item: not _starts_processes(item.path))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -26,15 +26,8 @@ from service.procedure.runner import ReplayMismatchError, same_step
 from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steps import outcome_from_json
 from sr_engine.errors import EngineError
-from sr_engine.worker import (
-    Frames,
-    PointSpreads,
-    UnusableSlicesError,
-    describe_result,
-    gather_frames,
-    localize_request,
-    recorded_point_spread,
-)
+from sr_engine.request import UnusableSlicesError, describe_result, recorded_point_spread
+from sr_engine.worker import Known, frames_then, gather_frames, localize_as_asked
 
 app = typer.Typer(add_completion=False)
 METHODS = ("ml", "base", "bicubic", "sr")
@@ -140,23 +133,24 @@ def _agrees(row: Procedure, ended: str) -> bool:
 
 def replay_measurements(record: CaseRecord, method: str | None) -> Iterator[ReplayedMeasurement]:
     """Make every measurement again, in order; `method` None: by the recorded method."""
-    psfs = PointSpreads()
+    known = Known()
     for row in record.measurements():
         if row.state != "requested":
-            yield _replay_one(record, row, method or row.method, psfs)
+            yield _replay_one(record, row, method or row.method, known)
 
 
 def _replay_one(
-    record: CaseRecord, row: Measurement, method: str, psfs: PointSpreads
+    record: CaseRecord, row: Measurement, method: str, known: Known
 ) -> ReplayedMeasurement:
     recorded = None if row.result is None else np.array(row.result["plane_mm"])
     frames, reason = 0, ""
     replayed = sigma = None
     try:
-        taken = _frames_then(gather_frames(record, row), row)
+        taken = frames_then(gather_frames(record, row), row)
         frames = len(taken.pixels)
-        psf = recorded_point_spread(row.result) or psfs.of(taken)
-        found = describe_result(taken, localize_request(taken, method, row.request, psf))
+        psf = recorded_point_spread(row.result) or known.psfs.of(taken)
+        answer = localize_as_asked(record, row, taken, psf, known, method)
+        found = describe_result(taken, answer)
         replayed = np.array(found["plane_mm"])
         sigma = axis_sigma(found["covariance_mm2"])
     except (EngineError, UnusableSlicesError, UnusableError) as error:
@@ -173,23 +167,6 @@ def _replay_one(
         difference,
         sigma,
         reason,
-    )
-
-
-def _frames_then(frames: Frames, row: Measurement) -> Frames:
-    """Only the slices that were there then: more may have been taken at the same hold later."""
-    known = (row.result or {}).get("slice_ids")
-    if known is None:
-        until_s = np.inf if row.finished_s is None else row.finished_s
-        known = [one.slice_id for one in frames.slices if one.received_s <= until_s]
-    then = [number for number, one in enumerate(frames.slices) if one.slice_id in known]
-    if not then:
-        raise UnusableSlicesError("no_slices", "the slices of this measurement are not assigned")
-    return replace(
-        frames,
-        pixels=frames.pixels[then],
-        shifts_px=frames.shifts_px[then],
-        slices=tuple(frames.slices[number] for number in then),
     )
 
 

@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from typing import Any
 
+from scipy.special import chdtri
+
 from service.commissioning.clocks import ClockFinding
 from service.commissioning.imaging import ImagingFinding
 
@@ -15,6 +17,7 @@ _LATEST_S = 120.0
 _LEAST_SNR = 8.0
 _MOST_CHI2 = 1.5
 _MOST_SCATTER = 1.5  # of what a localization says of itself
+_BY_CHANCE = 0.001
 _OIL_SIGMA = 5.0
 
 
@@ -91,13 +94,20 @@ def _imaging_items(found: ImagingFinding) -> list[Item]:
         ),
         Item(
             "Scatter of the centre against the reported σ",
-            f"{found.scatter_px:.4f} px, {found.sigma_px:.4f} px",
-            f"at most {_MOST_SCATTER:g} of it",
-            found.scatter_px <= _MOST_SCATTER * found.sigma_px,
+            f"{found.scatter_px:.4f} px ({found.scatter_dof} degrees of freedom), "
+            f"{found.sigma_px:.4f} px",
+            f"at most {_MOST_SCATTER:g} of it, beyond chance ({_BY_CHANCE:.1%})",
+            found.scatter_px <= _MOST_SCATTER * found.sigma_px * _chance(found.scatter_dof),
         ),
         Item(
             "Pixel size from the header", "{:g} x {:g} mm".format(*found.spacing_mm), "square",
             math.isclose(*found.spacing_mm, rel_tol=1e-3),
+        ),
+        Item(
+            "Chi squared per degree of freedom of the fiducial's own template",
+            found.template_problem or f"{found.template_chi2:.2f}",
+            f"at most {_MOST_CHI2:g}",
+            None if found.template_problem else found.template_chi2 <= _MOST_CHI2,
         ),
         Item("Distortion", corrected[found.distortion_corrected], "", None),
         Item(
@@ -107,6 +117,11 @@ def _imaging_items(found: ImagingFinding) -> list[Item]:
             bool(found.polarity) and _is_as_expected(found),
         ),
     ]  # fmt: skip
+
+
+def _chance(dof: int) -> float:
+    """By what factor a scatter of few values may be too large without being so."""
+    return math.sqrt(float(chdtri(dof, _BY_CHANCE)) / dof)
 
 
 def _psf_words(found: ImagingFinding) -> str:

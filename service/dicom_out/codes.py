@@ -57,6 +57,8 @@ TARGET_AT = (
 )
 _METHODS = {
     "ml": "Maximum-likelihood fit of the imaged fiducial to all slices",
+    "template": "Maximum-likelihood fit of the fiducial's own image to all slices",
+    "outline": "Middle of the outline of a compact object",
     "sr": "Circle found in the super-resolution image",
     "bicubic": "Circle found in the bicubic interpolation of one slice",
     "base": "Circle found in one slice as acquired",

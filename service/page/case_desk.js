@@ -4,6 +4,9 @@ import { order } from "./api.js";
 import { act } from "./actions.js";
 import { byId, h, replace, setHidden, whenChanged } from "./dom.js";
 import { clock } from "./format.js";
+import { TEXTS } from "./texts.js";
+
+const T = TEXTS.caseDesk;
 
 // What ends a case is not under the pointer at once: a click that was meant for another button.
 const READ_FIRST_MS = 700;
@@ -20,30 +23,30 @@ function newCase() {
       event.preventDefault();
       act(() => order("POST", "api/v1/cases", Object.fromEntries(new FormData(form))));
     },
-  }, field("label", "Name of the case (no patient's name)"), field("operator", "Operator"), field("note", "Note"),
-  h("p", {}, h("button", { class: "main" }, "Begin the case")));
+  }, field("label", T.label), field("operator", T.operator), field("note", T.note),
+  h("p", {}, h("button", { class: "main" }, T.start)));
   return form;
 }
 
 function finishCase() {
   const box = h("div", { class: "finish-case" });
-  const closed = () => replace(box, h("button", { type: "button", class: "plain", onclick: opened }, "Finish the case …"));
+  const closed = () => replace(box, h("button", { type: "button", class: "plain", onclick: opened }, T.finish));
   const opened = () => {
     const finish = h("button", {
       type: "button", disabled: true,
       onclick: () => act(() => order("POST", "api/v1/case/finish")),
-    }, "Finish the case now");
+    }, T.finishNow);
     setTimeout(() => { finish.disabled = false; }, READ_FIRST_MS);
     replace(box,
-      h("p", {}, "The robot is disarmed, and nothing of this case changes any more. Report and export are written into its folder."),
-      h("p", {}, h("button", { type: "button", onclick: closed }, "Not yet"), " ", finish));
+      h("p", {}, T.finishWhy),
+      h("p", {}, h("button", { type: "button", onclick: closed }, T.notYet), " ", finish));
   };
   closed();
   return box;
 }
 
 const goOn = () => h("div", { class: "go-on" },
-  h("button", { type: "button", class: "main", onclick: () => act(() => order("POST", "api/v1/case/continue")) }, "Go on with this case"));
+  h("button", { type: "button", class: "main", onclick: () => act(() => order("POST", "api/v1/case/continue")) }, T.goOn));
 
 // Made once for each of its ways and left alone: what was typed must stay.
 export const drawCaseDesk = whenChanged(({ folder, begins, asks, role, busy }) => {
@@ -60,12 +63,12 @@ export const drawHolding = whenChanged(({ holding, folder, role, busy }) => {
   const take = (held) => h("button", {
     type: "button", disabled: busy,
     onclick: () => act(() => order("POST", "api/v1/holding/take", { study: held.study })),
-  }, "Take into this case");
+  }, T.take);
   const rows = holding.map((held) => h("tr", {},
-    h("td", { class: "left" }, `${held.slices} ${held.slices === 1 ? "slice" : "slices"}`, held.description ? `, ${held.description}` : ""),
+    h("td", { class: "left" }, TEXTS.count(held.slices, "slice"), held.description ? `, ${held.description}` : ""),
     h("td", { class: "left" }, clock(held.first_received_s), held.slices > 1 ? ` to ${clock(held.last_received_s)}` : ""),
     h("td", { class: "left" }, held.reason),
     h("td", {}, folder && held.may_be_taken && role === "operator" ? take(held) : null)));
-  const head = ["What", "Received", "Why", ""].map((name) => h("th", { scope: "col" }, name));
+  const head = T.columns.map((name) => (name ? h("th", { scope: "col" }, name) : h("td", {})));
   replace(byId("holding"), h("table", {}, h("thead", {}, h("tr", {}, head)), h("tbody", {}, rows)));
 });

@@ -40,7 +40,7 @@ export const TEXTS = {
     acquired: (hold) => `Slices for hold ${hold} acquired`,
     abort: "End the procedure",
     needleOutSure: "Yes, the needle is out of the patient – unlock",
-    needleOutWhy: "Motion is unlocked by this. Is the needle out of the patient?",
+    needleOutWhy: "This unlocks motion. Is the needle out of the patient?",
     drives: (axis, stops) => `${axis}: ${stops} mm`,
     drivesWhy: "The calibration drives the stages without asking again:",
     drivesSure: "Drive the stages – calibrate",
@@ -52,7 +52,7 @@ export const TEXTS = {
   plan: {
     row: "row", col: "column", picture: "The move as seen in the slice",
     parts: { upper: "Upper fiducial", lower: "Lower fiducial", tip: "Needle tip" },
-    distance: "Off by, before this move",
+    distance: "Distance to target, before this move",
   },
 
   distance: {
@@ -76,7 +76,8 @@ export const TEXTS = {
   },
 
   image: {
-    layouts: { slice: "Slice", both: "Both", reconstruction: "Reconstruction", blend: "Blended" },
+    layouts: { slice: "Slice", both: "Both", reconstruction: "Reconstruction", blend: "Blended", residual: "Residual" },
+    residual: "Residual", residualOf: (id, chi2) => `Slice ${id} − model${chi2 ? `, χ² ${chi2} per degree of freedom` : ""}`, noResidual: "No fitted model yet.",
     which: "Image shown", window: "Window", level: "Level", auto: "Auto", blend: "Blend", smooth: "Smooth", profile: "Profile",
     zoom: "Zoom", zoomIn: "Zoom in", zoomOut: "Zoom out", whole: "Whole", fiducial: "Fiducial",
     noSlice: "No slice yet.", noReconstruction: "No reconstruction yet: it needs slices at several commanded shifts.",
@@ -87,11 +88,11 @@ export const TEXTS = {
     age: (id, at, age) => `Slice ${id}: received ${at}, ${age} ago`, source: (state, time) => `${state}${time ? ` · time from ${time}` : ""}`,
     cursor: (words, row, col, value) => `${words}  ·  row ${row}  column ${col}  ·  value ${value}`,
     profileOf: (row) => `Intensity along row ${row} (solid) and its column (dashed) through the fiducial, mm from its centre`,
-    newest: "Newest",
+    newest: "Newest", camera: "Camera",
   },
   strip: {
     heading: "Slices of this case", newer: "Newer slices", older: "Older slices", empty: "No slices.",
-    kinds: { assigned: "used", pending: "waiting", aside: "set aside", planning: "planning" },
+    kinds: { assigned: "used", pending: "pending", aside: "set aside", planning: "planning" },
     position: (side, mm) => `${side} ${mm}`,
     show: (id, kind, where) => `${id} ${kind}${where ? ` ${where}` : ""}: show this slice`,
   },
@@ -106,8 +107,9 @@ export const TEXTS = {
     reachable: "Within the robot's travel.", unreachable: (axis, mm, low, high) => `Out of reach: axis ${axis} would have to go to ${mm} mm (travel ${low} to ${high} mm).`,
     empty: (field) => `Not set: ${field} is empty.`,
     reachUnknown: "Reach is known after a calibration.",
+    told: { within: () => "Within the robot's travel.", out: (why) => `Out of reach: ${why}.`, unknown: (why) => `${why.charAt(0).toUpperCase()}${why.slice(1)}.` },
     setTarget: "Set target", setEntry: "Set entry point", withdraw: "Withdraw the target", cancel: "Cancel",
-    notSlice: "The point lies in the slice that is shown.",
+    notSlice: "The point lies in the slice shown.",
   },
 
   history: {
@@ -121,20 +123,26 @@ export const TEXTS = {
   alarms: { heading: "Alarms", none: "No alarms.", todo: "What to do:", more: (count) => `${count} more`, all: "All alarms" },
   events: { heading: "Event log", more: "Show more", fewer: "Show fewer", from: (id, source) => `event ${id}, from ${source}` },
   aside: {
-    heading: "Slices set aside", columns: ["Slice", "Received", "Why", ""], none: "None.", use: (hold) => `Use at hold ${hold}`, why: "Why is it of this hold?",
+    heading: "Slices set aside", columns: ["Slice", "Received", "Why", ""], none: "None.", use: (hold) => `Use at hold ${hold}`, why: "Why does it belong to this hold?",
     giveUp: "No more slices will come for hold", giveUpButton: "Stop waiting for these slices", giveUpWhy: "said on the page",
   },
   caseCard: {
     heading: "Case", label: "Case name", operator: "Operator", note: "Note", save: "Save", saved: "Saved.",
-    report: "Report", print: "Report to print", exported: "Export as zip",
-    about: (uid) => `Case ${uid || "not begun"}. Do not enter patient names: the record is exported as it is.`,
+    report: "Report", print: "Printable report", exported: "Export as zip",
+    about: (uid) => `Case ${uid || "not started"}. Do not enter patient names: the record is exported as it is.`,
+  },
+  caseDesk: {
+    label: "Case name (no patient name)", operator: "Operator", note: "Note", start: "Start the case", goOn: "Continue this case",
+    finish: "Finish the case …", finishNow: "Finish the case now", notYet: "Not yet",
+    finishWhy: "This disarms the robot and closes the case. Report and export are written to its folder.",
+    columns: ["What", "Received", "Why", ""], take: "Add to this case",
   },
   targets: {
     heading: "Targets of this case", columns: ["Target", "Patient mm (LPS)", "Approaches", ""], none: "None yet.", current: "current", again: "Use again",
     againLabel: (name) => `Use again: target ${name}`, tissue: " (in tissue)",
   },
   past: {
-    heading: "Cases", columns: ["Case", "Begun", "Slices", "Measured", "Punctures", "Documents"], none: "None.",
+    heading: "Cases", columns: ["Case", "Started", "Slices", "Measured", "Punctures", "Documents"], none: "None.",
     report: "report", zip: "zip", reportOf: (name) => `Report of ${name}`, exportOf: (name) => `zip: export of ${name}`,
   },
   oldCase: {
@@ -145,13 +153,13 @@ export const TEXTS = {
     same: "agrees with the room clock", ahead: (s) => `is ${s} s ahead of the room clock`, behind: (s) => `is ${s} s behind the room clock`,
     known: (words, s, who) => `The scanner clock ${words}, ± ${s} s; ${who}`, compared: (when, who) => `compared ${when} by ${who}`, ago: "ago",
     reads: "Scanner clock reads", now: "Scanner clock reads this now", then: (words) => `The scanner clock ${words}.`,
-    bad: "Type what the scanner clock reads, for example 10:32:07.", use: "Use this", forget: "The scanner clock was changed: forget this",
-    forgetTitle: "Slices wait until the clocks are compared again.", why: "said on the page",
+    bad: "Type what the scanner clock reads, for example 10:32:07.", use: "Use this", forget: "The scanner clock was changed: discard this",
+    forgetTitle: "Slices stay pending until the clocks are compared again.", why: "said on the page",
   },
   system: {
     heading: "System", service: "Service", robot: "Robot", slices: "Slices", none: "none", linked: (boot) => `linked, session ${boot}`,
     counters: { autospine_link_frames_sent: "Frames sent to the robot", autospine_link_frames_resent: "Frames sent again", autospine_link_frames_bad: "Frames received damaged", autospine_viewers: "Screens open" },
-    roundTrip: "Round trip to the robot", states: { assigned: "used", quarantined: "set aside", pending: "waiting" },
+    roundTrip: "Round trip to the robot", states: { assigned: "used", quarantined: "set aside", pending: "pending" },
   },
   belief: {
     heading: "What the system believes",
@@ -162,7 +170,7 @@ export const TEXTS = {
     fiducial: "Fiducial σ", sigmaOf: (row, col) => `${row} mm along rows, ${col} mm along columns`,
     madeOf: "Made of", why: "Another slice?",
     slice: (id) => `slice ${id}`, noMeasurement: "no measurement yet",
-    settings: "Change for this case", mostSlices: "Slices at one position, at most", apply: "Apply", applied: "Applied.",
+    settings: "Change for this case", mostSlices: "Most slices at one position", apply: "Apply", applied: "Applied.",
     bounds: (low, high) => `${low} to ${high}`,
   },
   proposals: {

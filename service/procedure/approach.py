@@ -113,8 +113,10 @@ class SteeredFiducial:
 
     def probability(self, estimate: FiducialEstimate) -> float:
         """That the fiducial is within the tolerance."""
-        error = self.error_mm(estimate)
-        return probability_within(error, estimate.covariance_mm2, self.arguments.tolerance_mm)
+        error, tolerance_mm = self.error_mm(estimate), self.arguments.tolerance_mm
+        return probability_within(
+            error, self.arguments.as_judged(estimate).covariance_mm2, tolerance_mm
+        )
 
     def is_sure(self, estimate: FiducialEstimate) -> bool:
         return self.probability(estimate) >= self.arguments.confidence
@@ -137,7 +139,7 @@ def _arrival(fiducial: SteeredFiducial, standing: Standing[Look]) -> Arrival:
     return Arrival(
         standing.calibration,
         float(np.linalg.norm(fiducial.error_mm(estimate))),
-        axis_sigma(estimate.covariance_mm2),
+        axis_sigma(fiducial.arguments.as_judged(estimate).covariance_mm2),
         fiducial.probability(estimate),
         standing.iterations,
         standing.frames,

@@ -9,14 +9,18 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import pairwise
 from typing import Any, Protocol, TypeVar
 
 import numpy as np
+from scipy.linalg import block_diag
 
 from service.procedure.estimate import FiducialEstimate, MotionNoise
 from service.procedure.jacobian import CalibrationError, ImageJacobian
 from service.procedure.plane import ImagePlane
 from service.procedure.sensing import (
+    ML,
+    TEMPLATE,
     Expectation,
     ProcedureFailedError,
     ValidationGate,
@@ -24,19 +28,25 @@ from service.procedure.sensing import (
     estimate_from,
     measure_here,
     measure_shift_set,
+    measure_step,
     move,
 )
-from service.procedure.steps import Measured, MoveTo, ProcedureSteps
+from service.procedure.steps import HoldShift, Measured, MoveTo, ProcedureSteps, ask
 
+DISC = "disc"
 _ASYMMETRY_CHECK_SIGMA = 5.0
 # twice what the directions of an axis are taken to differ by: a stage that was driven into its stop
 # comes back further than it went out
 _LARGEST_ASYMMETRY = 0.10
+Templates = tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True)
 class CalibrationArguments:
-    """last: this robot's last image Jacobian; same_mount: it was not mounted anew since."""
+    """last: this robot's last image Jacobian; same_mount: it was not mounted anew since.
+
+    localization: what is fitted once the fiducial was seen: its own image ("template") or "disc".
+    """
 
     axes: tuple[str, str]
     origin_um: Mapping[str, int]
@@ -46,6 +56,51 @@ class CalibrationArguments:
     method: str = "ml"
     last: Mapping[str, Any] | None = None
     same_mount: bool = False
+    localization: str = DISC
+
+
+@dataclass(frozen=True)
+class FoundBy:
+    """How fiducials are found, and what all places found so have in common.
+
+    templates: for each fiducial the measurements that its image is learnt from; none: a disc is
+    fitted. systematic_mm: std, for each coordinate, of what is said to be the middle; own_mm: of
+    that, what the noise in the template's own measurements does.
+    """
+
+    templates: tuple[tuple[int, ...], ...] = ()
+    systematic_mm: tuple[float, ...] = ()
+    own_mm: tuple[float, ...] = ()
+
+    @classmethod
+    def of(cls, answers: Sequence[Measured], templates: Templates) -> FoundBy:
+        return cls(
+            templates,
+            tuple(x for answer in answers for x in answer.systematic_mm),
+            tuple(x for answer in answers for x in answer.own_mm),
+        )
+
+    def template_of(self, fiducial: int) -> tuple[int, ...]:
+        """The measurements that show one fiducial's image; empty where there is none."""
+        return self.templates[fiducial] if self.templates else ()
+
+    def to_json(self) -> dict[str, Any]:
+        return {
+            "templates": [list(ids) for ids in self.templates],
+            "systematic_mm": list(self.systematic_mm),
+            "own_mm": list(self.own_mm),
+        }
+
+    @classmethod
+    def from_json(cls, value: Mapping[str, Any]) -> FoundBy:
+        return cls(
+            tuple(tuple(ids) for ids in value["templates"]),
+            tuple(value["systematic_mm"]),
+            tuple(value["own_mm"]),
+        )
+
+
+BY_DISC = FoundBy()
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +111,10 @@ class Calibration:
     estimate: FiducialEstimate
     plane: ImagePlane
     measurement_id: int
+    found_by: FoundBy = BY_DISC
+
+    def template_of(self, fiducial: int = 0) -> tuple[int, ...]:
+        return self.found_by.template_of(fiducial)
 
     def to_json(self) -> dict[str, Any]:
         return {
@@ -63,6 +122,7 @@ class Calibration:
             "estimate": self.estimate.to_json(),
             "plane": self.plane.to_json(),
             "measurement_id": self.measurement_id,
+            "found_by": self.found_by.to_json(),
         }
 
     @classmethod
@@ -72,6 +132,7 @@ class Calibration:
             FiducialEstimate.from_json(value["estimate"]),
             ImagePlane.from_json(value["plane"]),
             value["measurement_id"],
+            FoundBy.from_json(value["found_by"]) if "found_by" in value else BY_DISC,
         )
 
 
@@ -84,6 +145,10 @@ class Seen(Protocol):
     @property
     def plane(self) -> ImagePlane: ...
 
+    @property
+    def all_measured(self) -> tuple[Measured, ...]:
+        """Of each fiducial."""
+
     def at(self, setpoints_um: Mapping[str, int]) -> FiducialEstimate: ...
 
 
@@ -92,6 +157,11 @@ class OneSeen:
     """One fiducial at one hold."""
 
     measured: Measured
+    hold_id: int
+
+    @property
+    def all_measured(self) -> tuple[Measured, ...]:
+        return (self.measured,)
 
     @property
     def measurement_id(self) -> int:
@@ -108,6 +178,10 @@ class OneSeen:
 SeenThere = TypeVar("SeenThere", bound=Seen)
 # of the place before and, where there is one, of the prediction for this place
 LookThere = Callable[[FiducialEstimate | None, FiducialEstimate | None], ProcedureSteps[SeenThere]]
+# at what was seen last, expected there, by the measurements that show each fiducial
+LookByTemplate = Callable[
+    [SeenThere, FiducialEstimate, Templates], ProcedureSteps[tuple[Measured, ...]]
+]
 
 
 def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
@@ -117,7 +191,19 @@ def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
         before: FiducialEstimate | None, predicted: FiducialEstimate | None
     ) -> ProcedureSteps[OneSeen]:
         expectation = _expectation(before, predicted, arguments)
-        return OneSeen((yield from measure_here(arguments.method, expectation))[1])
+        by_template = arguments.localization == TEMPLATE and arguments.method == ML
+        acquired, measured = yield from measure_here(
+            arguments.method, expectation, any_shape=by_template
+        )
+        return OneSeen(measured, acquired.hold_id)
+
+    def look_by_template(
+        last: OneSeen, expected: FiducialEstimate, templates: Templates
+    ) -> ProcedureSteps[tuple[Measured, ...]]:
+        holds = (HoldShift(last.hold_id, (0.0, 0.0)),)
+        expectation = arguments.gate.around(expected)
+        step = measure_step(holds, arguments.method, expectation, template=templates[0])
+        return ((yield from ask(step, Measured)),)
 
     found = yield from drive_and_learn(
         _places(arguments),
@@ -125,14 +211,22 @@ def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
         replace(arguments.gate, gate_sigma=_ASYMMETRY_CHECK_SIGMA),
         look,
         _check,
+        look_by_template if arguments.localization == TEMPLATE else None,
     )
-    if arguments.last is not None:
-        last, scale_error = ImageJacobian.from_json(arguments.last), arguments.gate.scale_error
-        same_mount = arguments.same_mount
-        _refuse(
-            lambda: found.jacobian.check_is_of_same_robot(last, scale_error, same_mount=same_mount)
-        )
+    check_is_as_last(found, arguments.last, arguments.gate, same_mount=arguments.same_mount)
     return (yield from _refine(found, arguments))
+
+
+def check_is_as_last(
+    found: Calibration, last: Mapping[str, Any] | None, gate: ValidationGate, *, same_mount: bool
+) -> None:
+    """Refuse what is not as the last image Jacobian (JSON) of this robot, if there was one."""
+    if last is None:
+        return
+    before, scale_error = ImageJacobian.from_json(last), gate.scale_error
+    _refuse(
+        lambda: found.jacobian.check_is_of_same_robot(before, scale_error, same_mount=same_mount)
+    )
 
 
 def drive_and_learn(
@@ -141,39 +235,85 @@ def drive_and_learn(
     gate: ValidationGate,
     look: LookThere[SeenThere],
     check: Callable[[ImageJacobian], None],
+    by_template: LookByTemplate[SeenThere] | None = None,
 ) -> ProcedureSteps[Calibration]:
     """Drive to each place, look, and learn from each move; the last one is predicted.
 
     The last place is the way back: `check` must be content before it is driven, and what is seen
-    there must be what was predicted.
+    there must be what was predicted. by_template: looks once more at the last place, by the image
+    that all places together show; then all of them are taken as that image finds them.
     """
-    first: FiducialEstimate | None = None
     before: FiducialEstimate | None = None
     plane: ImagePlane | None = None
+    learnt, stops, seen_there = jacobian, [], []
     for number, setpoints_um in enumerate(places):
         last = number == len(places) - 1
         if last:
-            check(jacobian)
+            check(learnt)
         moved = yield from move(
             MoveTo(dict(setpoints_um), f"calibration {number + 1}/{len(places)}")
         )
         predicted = None
         if last and before is not None:
-            predicted = before.moved_to(moved.readback_um, jacobian, gate.noise)
+            predicted = before.moved_to(moved.readback_um, learnt, gate.noise)
         seen = yield from look(before, predicted)
         plane = _checked_plane(plane, seen.plane)
         here = seen.at(moved.readback_um)
         if predicted is not None:
             check_prediction(predicted, here, gate)
         if before is not None:
-            jacobian = learn_from_move(jacobian, before, here, gate.noise)
-        before, first = here, first or here
-    assert before is not None
+            learnt = learn_from_move(learnt, before, here, gate.noise)
+        before = here
+        stops.append(here)
+        seen_there.append(seen)
     assert plane is not None
-    check(jacobian)
-    assert first is not None
-    _refuse(lambda: _check_there_and_back(jacobian, first, before, places))
-    return Calibration(jacobian, before, plane, seen.measurement_id)
+    known = Calibration(learnt, stops[-1], plane, seen_there[-1].measurement_id)
+    if by_template is not None:
+        templates = tuple(
+            tuple(one.measurement_id for one in views)
+            for views in zip(*(seen.all_measured for seen in seen_there), strict=True)
+        )
+        answers = yield from by_template(seen_there[-1], stops[-1], templates)
+        known, stops = _as_templates_find(known, stops, answers, templates)
+        for one, other in pairwise(stops):
+            if other is stops[-1]:
+                predicted = one.moved_to(other.setpoints_um, jacobian, gate.noise)
+                check_prediction(predicted, other, gate)
+            jacobian = learn_from_move(jacobian, one, other, gate.noise)
+        known = replace(known, jacobian=jacobian, estimate=stops[-1])
+    check(known.jacobian)
+    _refuse(lambda: _check_there_and_back(known.jacobian, stops[0], stops[-1], places))
+    return known
+
+
+def _as_templates_find(
+    known: Calibration,
+    stops: list[FiducialEstimate],
+    answers: Sequence[Measured],
+    templates: Templates,
+) -> tuple[Calibration, list[FiducialEstimate]]:
+    """The calibration by the fiducials' own images, and where they were by them at every stop.
+
+    As it was where a disc answered instead: then that is what the next looks are by, too.
+    """
+    for answer in answers:
+        if not answer.ok:
+            raise ProcedureFailedError(answer.reason_code, answer.reason)
+    newest = max(answer.measurement_id for answer in answers)
+    if any(answer.method != TEMPLATE for answer in answers):
+        return replace(known, measurement_id=newest), stops
+    found = []
+    for number, stop in enumerate(stops):
+        views = [answer.views[number] for answer in answers]
+        found.append(
+            FiducialEstimate(
+                stop.setpoints_um,
+                np.concatenate([view.plane_mm for view in views]),
+                block_diag(*(view.covariance_mm2 for view in views)),
+            )
+        )
+    found_by = FoundBy.of(answers, templates)
+    return replace(known, measurement_id=newest, found_by=found_by), found
 
 
 def _check_there_and_back(
@@ -264,6 +404,7 @@ def _refine(found: Calibration, arguments: CalibrationArguments) -> ProcedureSte
         arguments.method,
         expectation,
         arguments.gate.noise,
+        found.template_of(),
     )
     # all that was known before has been through the same moves: nothing to add
     return replace(found, estimate=shifted.estimate, measurement_id=shifted.measured.measurement_id)

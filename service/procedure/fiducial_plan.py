@@ -14,7 +14,7 @@ from service.procedure.identity import ProofArguments
 from service.procedure.plan import Travel, check_travel
 from service.procedure.recording import RecordingArguments
 from service.procedure.sensing import ValidationGate
-from service.procedure.targets import Target, fiducial_must_appear_at
+from service.procedure.targets import Target, common_part_mm, fiducial_must_appear_at
 from sr_engine.reconstruction.shiftset import named, paper_random
 
 # a recorded target is to be known this much better than it must be reached
@@ -44,6 +44,7 @@ def calibration_of(config: Config, travel: Mapping[str, Travel], seed: int) -> C
         move_um=move_um,
         shifts_px=_shifts_px(service.shift_set, seed),
         gate=gate_of(config),
+        localization=config.imaging.localization,
     )
 
 
@@ -76,6 +77,7 @@ def approach_of(
         seed=seed,
         proven=proven,
         most_frames=service.most_slices,
+        systematic_mm=common_part_mm(target, start),
     )
 
 

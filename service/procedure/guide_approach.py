@@ -101,7 +101,7 @@ class SteeredGuide:
         self, calibration: Calibration, way: Way, *, number: int, fresh: bool
     ) -> ProcedureSteps[GuideLook]:
         arguments = self.arguments
-        return look_at_guide(arguments.geometry, calibration.estimate, arguments.gate, fresh=fresh)
+        return look_at_guide(arguments.geometry, calibration, arguments.gate, fresh=fresh)
 
     def look_longer(
         self, seen: GuideLook, estimate: FiducialEstimate
@@ -137,6 +137,7 @@ class SteeredGuide:
     def probability(self, estimate: FiducialEstimate) -> float:
         """That the tip is within the tolerance, and the lower fiducial too: the smaller of both."""
         tolerance_mm = self.arguments.tolerance_mm
+        estimate = self.arguments.as_judged(estimate)
         tip_covariance = tip_of(self.arguments.geometry, estimate)[1]
         at_tip = probability_within(self.error_mm(estimate), tip_covariance, tolerance_mm)
         lower = np.array(self.arguments.target_mm)[2:] - estimate.plane_mm[2:]
@@ -165,7 +166,7 @@ def _arrival(guide: SteeredGuide, standing: Standing[GuideLook]) -> GuideArrival
     return GuideArrival(
         calibration,
         guide.error_mm(estimate),
-        tip_of(geometry, estimate)[1],
+        tip_of(geometry, arguments.as_judged(estimate))[1],
         geometry.tip_beyond_mm,
         line.at(-geometry.tip_beyond_mm),
         line.point_mm,

@@ -4,17 +4,31 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.procedure.calibration import Calibration, drive_and_learn
+from service.procedure.calibration import (
+    DISC,
+    Calibration,
+    Templates,
+    check_is_as_last,
+    drive_and_learn,
+)
 from service.procedure.estimate import FiducialEstimate
 from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_looking import BothSeen, gates, see_both
 from service.procedure.jacobian import SMALLEST_ANGLE_DEG, ImageJacobian
-from service.procedure.sensing import Expectation, ProcedureFailedError, ValidationGate
-from service.procedure.steps import ProcedureSteps
+from service.procedure.sensing import (
+    ML,
+    TEMPLATE,
+    Expectation,
+    ProcedureFailedError,
+    ValidationGate,
+    measure_step,
+)
+from service.procedure.steps import HoldShift, Measured, ProcedureSteps, ask
 
 Array = NDArray[np.float64]
 _FIRST_GATE = 1.4
@@ -23,13 +37,19 @@ _SHARE_TOLERANCE = 0.35
 
 @dataclass(frozen=True)
 class GuideCalibrationArguments:
-    """axes: the top stage's two, then the bottom stage's two."""
+    """axes: the top stage's two, then the bottom stage's two.
+
+    last: this robot's last image Jacobian with four axes; same_mount: not mounted anew since.
+    """
 
     axes: tuple[str, str, str, str]
     origin_um: Mapping[str, int]
     move_um: int
     geometry: GuideGeometry
     gate: ValidationGate
+    localization: str = DISC
+    last: Mapping[str, Any] | None = None
+    same_mount: bool = False
 
 
 def calibrate_guide(arguments: GuideCalibrationArguments) -> ProcedureSteps[Calibration]:
@@ -39,17 +59,36 @@ def calibrate_guide(arguments: GuideCalibrationArguments) -> ProcedureSteps[Cali
         before: FiducialEstimate | None, predicted: FiducialEstimate | None
     ) -> ProcedureSteps[BothSeen]:
         expected = _expectations(arguments, before, predicted)
-        return (yield from see_both(arguments.geometry, expected))
+        by_template = arguments.localization == TEMPLATE
+        return (yield from see_both(arguments.geometry, expected, any_shape=by_template))
 
-    return (
-        yield from drive_and_learn(
-            _places(arguments),
-            ImageJacobian.unknown(arguments.axes),
-            arguments.gate,
-            look,
-            lambda jacobian: _check_shares(jacobian, arguments.geometry),
+    def look_by_template(
+        last: BothSeen, expected: FiducialEstimate, templates: Templates
+    ) -> ProcedureSteps[tuple[Measured, ...]]:
+        answers = []
+        places = zip(
+            last.acquired,
+            gates(expected, arguments.gate),
+            arguments.geometry.slice_positions_mm,
+            templates,
+            strict=True,
         )
+        for acquired, expectation, at_mm, template in places:
+            holds = (HoldShift(acquired.hold_id, (0.0, 0.0)),)
+            step = measure_step(holds, ML, expectation, slice_position_mm=at_mm, template=template)
+            answers.append((yield from ask(step, Measured)))
+        return tuple(answers)
+
+    found = yield from drive_and_learn(
+        _places(arguments),
+        ImageJacobian.unknown(arguments.axes),
+        arguments.gate,
+        look,
+        lambda jacobian: _check_shares(jacobian, arguments.geometry),
+        look_by_template if arguments.localization == TEMPLATE else None,
     )
+    check_is_as_last(found, arguments.last, arguments.gate, same_mount=arguments.same_mount)
+    return found
 
 
 def _places(arguments: GuideCalibrationArguments) -> list[dict[str, int]]:

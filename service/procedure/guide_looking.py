@@ -3,14 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
+from service.procedure.calibration import BY_DISC, Calibration, FoundBy
 from service.procedure.estimate import FiducialEstimate
 from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.plane import ImagePlane
 from service.procedure.sensing import (
+    ML,
     Expectation,
     ProcedureFailedError,
     ValidationGate,
@@ -20,7 +22,6 @@ from service.procedure.sensing import (
 from service.procedure.steps import Acquired, Measured, ProcedureSteps
 
 Expectations = tuple[Expectation | None, Expectation | None]
-_METHOD = "ml"
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,6 +30,10 @@ class BothSeen:
 
     acquired: tuple[Acquired, Acquired]
     measured: tuple[Measured, Measured]
+
+    @property
+    def all_measured(self) -> tuple[Measured, ...]:
+        return self.measured
 
     @property
     def frames(self) -> int:
@@ -66,6 +71,7 @@ class GuideLook:
     seen: BothSeen
     found: FiducialEstimate
     prior: FiducialEstimate
+    found_by: FoundBy
 
     @property
     def measurement_id(self) -> int:
@@ -90,14 +96,30 @@ class GuideLook:
 
 
 def see_both(
-    geometry: GuideGeometry, expected: Expectations, *, fresh: bool = False
+    geometry: GuideGeometry,
+    expected: Expectations,
+    found_by: FoundBy = BY_DISC,
+    *,
+    fresh: bool = False,
+    any_shape: bool = False,
 ) -> ProcedureSteps[BothSeen]:
     """One slice of each fiducial, the upper one's first."""
     upper_mm, lower_mm = geometry.slice_positions_mm
     first, upper = yield from measure_here(
-        _METHOD, expected[0], fresh=fresh, slice_position_mm=upper_mm
+        ML,
+        expected[0],
+        fresh=fresh,
+        slice_position_mm=upper_mm,
+        template=found_by.template_of(0),
+        any_shape=any_shape,
     )
-    second, lower = yield from measure_here(_METHOD, expected[1], slice_position_mm=lower_mm)
+    second, lower = yield from measure_here(
+        ML,
+        expected[1],
+        slice_position_mm=lower_mm,
+        template=found_by.template_of(1),
+        any_shape=any_shape,
+    )
     seen = BothSeen((first, second), (upper, lower))
     if not seen.plane.is_parallel_to(ImagePlane.from_json(lower.plane)):
         raise ProcedureFailedError(
@@ -107,11 +129,12 @@ def see_both(
 
 
 def look_at_guide(
-    geometry: GuideGeometry, prior: FiducialEstimate, gate: ValidationGate, *, fresh: bool
+    geometry: GuideGeometry, start: Calibration, gate: ValidationGate, *, fresh: bool
 ) -> ProcedureSteps[GuideLook]:
     """Look where both fiducials are believed to be."""
-    seen = yield from see_both(geometry, gates(prior, gate), fresh=fresh)
-    return GuideLook(seen, seen.at(prior.setpoints_um), prior)
+    prior, found_by = start.estimate, start.found_by
+    seen = yield from see_both(geometry, gates(prior, gate), found_by, fresh=fresh)
+    return GuideLook(seen, seen.at(prior.setpoints_um), prior, found_by)
 
 
 def look_at_guide_longer(
@@ -122,14 +145,19 @@ def look_at_guide_longer(
     places = zip(
         look.seen.acquired, gates(look.prior, gate), geometry.slice_positions_mm, strict=True
     )
-    for acquired, expected, at_mm in places:
+    for number, (acquired, expected, at_mm) in enumerate(places):
         one = yield from measure_again(
-            acquired, _METHOD, expected, frames=frames, slice_position_mm=at_mm
+            acquired,
+            ML,
+            expected,
+            frames=frames,
+            slice_position_mm=at_mm,
+            template=look.found_by.template_of(number),
         )
         again.append(one)
     (first, upper), (second, lower) = again
     seen = BothSeen((first, second), (upper, lower))
-    return GuideLook(seen, seen.at(look.prior.setpoints_um), look.prior)
+    return replace(look, seen=seen, found=seen.at(look.prior.setpoints_um))
 
 
 def gates(predicted: FiducialEstimate, gate: ValidationGate) -> Expectations:

@@ -19,7 +19,7 @@ from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_recording import GuideRecordingArguments
 from service.procedure.identity import ProofArguments
 from service.procedure.plan import Travel, check_travel
-from service.procedure.targets import Target, TargetError, needle_line, oil_shift_mm
+from service.procedure.targets import Target, TargetError, common_part_mm, needle_line, oil_shift_mm
 
 
 def geometry_of(guide: GuideConfig) -> GuideGeometry:
@@ -46,6 +46,7 @@ def guide_calibration_of(
         move_um=move_um,
         geometry=geometry_of(guide),
         gate=gate_of(config),
+        localization=config.imaging.localization,
     )
 
 
@@ -101,4 +102,5 @@ def guide_approach_of(
         gate=gate_of(config),
         proven=proven,
         most_frames=service.most_slices,
+        systematic_mm=common_part_mm(target, start),
     )

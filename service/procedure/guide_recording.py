@@ -76,7 +76,7 @@ def record_guide(
 ) -> ProcedureSteps[GuidePlace]:
     """Look at both fiducials where the robot stands, with as many slices as the bound asks for."""
     prior, geometry = start.estimate, arguments.geometry
-    look = yield from look_at_guide(geometry, prior, arguments.gate, fresh=True)
+    look = yield from look_at_guide(geometry, start, arguments.gate, fresh=True)
     check_prediction(prior, look.found, arguments.gate)
     if not arguments.proof.proven or look.after_loss:
         seen = replace(start, estimate=look.found, measurement_id=look.measurement_id)
@@ -86,9 +86,10 @@ def record_guide(
             arguments.proof,
             gate,
             "guide",
-            lambda there: look_at_guide(geometry, there.estimate, gate, fresh=False),
+            lambda there: look_at_guide(geometry, there, gate, fresh=False),
         )
-        look = yield from look_at_guide(geometry, prior, gate, fresh=False)
+        away = replace(start, estimate=prior)
+        look = yield from look_at_guide(geometry, away, gate, fresh=False)
         check_prediction(prior, look.found, gate)
     wanted = _slices_for(geometry, look, arguments.sigma_mm)
     if wanted > look.frames_of_each:

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtri
 
 from dicom_slice.reasons import Reason
 from service.procedure.estimate import FiducialEstimate, MotionNoise, motion_covariance
@@ -33,6 +33,7 @@ Array = NDArray[np.float64]
 _TRIES = 3
 # the slices could not be used: that says nothing of the fiducial
 _NOT_EVEN_LOOKED = frozenset({"no_slices", "geometry_changed", "disturbed", *map(str, Reason)})
+ML, TEMPLATE = "ml", "template"
 CONFIRM = "confirm"
 REJECT = "reject"
 RESCAN = "rescan"
@@ -110,18 +111,24 @@ def measure_here(
     *,
     fresh: bool = False,
     slice_position_mm: float | None = None,
+    template: Sequence[int] = (),
+    any_shape: bool = False,
 ) -> ProcedureSteps[tuple[Acquired, Measured]]:
     """Localize the fiducial in one slice taken where the robot stands; if it fails, scan again.
 
     fresh: the robot has not moved since the last measurement, which must not count twice.
+    template: the measurements that show the fiducial's image, by which the maximum-likelihood fit
+    then goes. any_shape: see `Measure`.
     """
     lost = False
     for attempt in range(_TRIES):
         # a new hold: the slices that could not be used stay out of the next try
         acquired = yield from ask(Acquire(1, fresh or attempt > 0, slice_position_mm), Acquired)
         holds = (HoldShift(acquired.hold_id, (0.0, 0.0)),)
-        step = _measure_step(holds, method, expectation, slice_position_mm=slice_position_mm)
-        measured = yield from ask(step, Measured)
+        step = measure_step(
+            holds, method, expectation, slice_position_mm=slice_position_mm, template=template
+        )
+        measured = yield from ask(replace(step, any_shape=any_shape), Measured)
         if measured.ok:
             return acquired, replace(measured, after_loss=lost)
         lost = lost or measured.reason_code not in _NOT_EVEN_LOOKED
@@ -145,12 +152,15 @@ def measure_again(
     *,
     frames: int,
     slice_position_mm: float | None = None,
+    template: Sequence[int] = (),
 ) -> ProcedureSteps[tuple[Acquired, Measured]]:
     """Take more slices at the same hold and localize from all of them."""
     more = yield from ask(Acquire(frames, slice_position_mm=slice_position_mm), Acquired)
     hold_ids = dict.fromkeys((acquired.hold_id, more.hold_id))
     holds = tuple(HoldShift(hold_id, (0.0, 0.0)) for hold_id in hold_ids)
-    step = _measure_step(holds, method, expectation, slice_position_mm=slice_position_mm)
+    step = measure_step(
+        holds, method, expectation, slice_position_mm=slice_position_mm, template=template
+    )
     measured = yield from ask(step, Measured)
     if not measured.ok:
         raise ProcedureFailedError(measured.reason_code, measured.reason)
@@ -173,6 +183,7 @@ def measure_shift_set(
     method: str,
     expectation: Expectation | None,
     noise: MotionNoise,
+    template: Sequence[int] = (),
 ) -> ProcedureSteps[ShiftSetResult]:
     """Take one slice at each commanded shift around the reference setpoints; localize from all.
 
@@ -200,13 +211,13 @@ def measure_shift_set(
     moved = yield from move(MoveTo(dict(reference.setpoints_um), "back to the reference"))
     readbacks.append(dict(moved.readback_um))
     sigma_mm = shift_sigma_mm(noise, len(holds))
-    step = _measure_step(tuple(holds), method, expectation, sigma_mm)
+    step = measure_step(tuple(holds), method, expectation, sigma_mm, template=template)
     measured = yield from ask(step, Measured)
     if not measured.ok:
         raise ProcedureFailedError(measured.reason_code, measured.reason)
     after = estimate_from(measured, moved.readback_um)
     spread = _way_back_covariance(readbacks, jacobian, noise)
-    if method == "ml":  # its covariance has the same errors in it, as if they were independent
+    if method == ML:  # its covariance has the same errors in it, as if they were independent
         spread = spread - np.eye(2) * sigma_mm**2 / len(holds)
     return ShiftSetResult(measured, replace(after, covariance_mm2=after.covariance_mm2 + spread))
 
@@ -267,7 +278,7 @@ def check_prediction(
     sigmas = predicted.distance_sigma(found.plane_mm, found.covariance_mm2)
     allowed = gate.gate_sigma
     if len(found.plane_mm) != 2:
-        allowed = math.sqrt(chi2.isf(chi2.sf(gate.gate_sigma**2, 2), len(found.plane_mm)))
+        allowed = math.sqrt(chdtri(len(found.plane_mm), math.exp(-(gate.gate_sigma**2) / 2)))
     if not sigmas <= allowed:
         miss = found.plane_mm - predicted.plane_mm
         listed = ", ".join(f"{value:+.3f}" for value in miss)
@@ -279,15 +290,23 @@ def check_prediction(
         )
 
 
-def _measure_step(
+def measure_step(
     holds: tuple[HoldShift, ...],
     method: str,
     expectation: Expectation | None,
     shift_sigma_mm: float = 0.0,
     slice_position_mm: float | None = None,
+    template: Sequence[int] = (),
 ) -> Measure:
+    """The maximum-likelihood fit is that of the template where there is one; see `Measure`."""
+    if method != ML:
+        template = ()
     step = Measure(
-        holds, method, shift_sigma_mm=shift_sigma_mm, slice_position_mm=slice_position_mm
+        holds,
+        TEMPLATE if template else method,
+        shift_sigma_mm=shift_sigma_mm,
+        slice_position_mm=slice_position_mm,
+        template=tuple(template),
     )
     if expectation is None:
         return step

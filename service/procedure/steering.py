@@ -38,7 +38,8 @@ class SteeringArguments:
     target_mm: in the image plane of the calibration, as the estimate has it. travel_um: lowest and
     highest setpoint of each axis. most_frames: slices at one position at the most. proven: what is
     measured was seen to move with the robot, see `identity`; otherwise READY is said only after a
-    move that shows it.
+    move that shows it. systematic_mm: std, for each coordinate, of what all places found so have in
+    common, where it counts: see `targets.common_part_mm`.
     """
 
     target_mm: tuple[float, ...]
@@ -50,10 +51,35 @@ class SteeringArguments:
     gate: ValidationGate
     proven: bool = True
     most_frames: int = 6
+    systematic_mm: tuple[float, ...] = ()
+
+    def as_judged(self, estimate: FiducialEstimate) -> FiducialEstimate:
+        """An estimate with what counts against the target beside its own uncertainty."""
+        if not self.systematic_mm:
+            return estimate
+        more = np.diag(np.square(self.systematic_mm))
+        return replace(estimate, covariance_mm2=estimate.covariance_mm2 + more)
 
     @property
     def travel(self) -> dict[str, Travel]:
         return {axis: Travel(low, high) for axis, (low, high) in self.travel_um.items()}
+
+
+def why_never_sure(
+    arguments: SteeringArguments, is_sure: Callable[[FiducialEstimate], bool]
+) -> str:
+    """Why READY could not be said even at the target, seen perfectly; empty where it could."""
+    size = len(arguments.target_mm)
+    there = FiducialEstimate({}, np.array(arguments.target_mm), np.zeros((size, size)))
+    if is_sure(there):
+        return ""
+    worst_mm = max(arguments.systematic_mm, default=0.0)
+    return (
+        f"the middle of the fiducial is known to {worst_mm:.3f} mm (σ, one axis), and for this "
+        f"target that counts in full: an error below {arguments.tolerance_mm:g} mm cannot be "
+        f"said with {100 * arguments.confidence:g} %. Widen the tolerance, or record a target at "
+        "the fiducial's own place"
+    )
 
 
 class AnyLook(Protocol):

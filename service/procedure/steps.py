@@ -59,7 +59,9 @@ class Measure:
 
     expected_plane_mm and gate_mm: where it must be (image plane), None when nothing is known.
     shift_sigma_mm: how far a hold may be from its shift, per axis (standard deviation).
-    slice_position_mm: only slices at this place along their normal; None: all.
+    slice_position_mm: only slices at this place along their normal; None: all. template: method
+    "template" learns the fiducial's image from these measurements. any_shape: what is no disc is
+    found by its outline, roughly.
     """
 
     holds: tuple[HoldShift, ...]
@@ -68,6 +70,17 @@ class Measure:
     gate_mm: float | None = None
     shift_sigma_mm: float = 0.0
     slice_position_mm: float | None = None
+    template: tuple[int, ...] = ()
+    any_shape: bool = False
+
+
+@dataclass(frozen=True)
+class SeenBefore:
+    """Where by its template the fiducial was in an earlier measurement, image plane mm."""
+
+    measurement_id: int
+    plane_mm: tuple[float, float]
+    covariance_mm2: tuple[tuple[float, float], tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -100,7 +113,9 @@ class Acquired:
 class Measured:
     """A measurement that succeeded (`reason_code` empty) or the reason why it did not.
 
-    after_loss: a try before it, at the same place, did not find the fiducial.
+    after_loss: a try before it, at the same place, did not find the fiducial. method: that
+    answered. systematic_mm: std (row, col) of what is common to all places found so. own_mm: of
+    that, how well the template's own place is known; views: of the measurements it is learnt from.
     """
 
     measurement_id: int
@@ -112,6 +127,10 @@ class Measured:
     frames: int = 0
     scan_s: float = 0.0
     after_loss: bool = False
+    method: str = ""
+    systematic_mm: tuple[float, float] = (0.0, 0.0)
+    own_mm: tuple[float, float] = (0.0, 0.0)
+    views: tuple[SeenBefore, ...] = ()
 
     @property
     def ok(self) -> bool:
@@ -154,6 +173,12 @@ def outcome_to_json(outcome: Outcome) -> dict[str, Any]:
     return asdict(outcome)
 
 
+def seen_before(value: Mapping[str, Any]) -> SeenBefore:
+    row, col = value["plane_mm"]
+    (a, b), (c, d) = value["covariance_mm2"]
+    return SeenBefore(value["measurement_id"], (row, col), ((a, b), (c, d)))
+
+
 def outcome_from_json(kind: str, value: Mapping[str, Any]) -> Outcome:
     """Return the outcome of a step of this kind as it was recorded."""
     fields = dict(value)
@@ -162,4 +187,7 @@ def outcome_from_json(kind: str, value: Mapping[str, Any]) -> Outcome:
         fields["plane_mm"] = (first, second)
         (a, b), (c, d) = fields["covariance_mm2"]
         fields["covariance_mm2"] = ((a, b), (c, d))
+        for name in ("systematic_mm", "own_mm"):
+            fields[name] = tuple(fields.get(name, (0.0, 0.0)))
+        fields["views"] = tuple(seen_before(view) for view in fields.get("views", ()))
     return _OUTCOMES[kind](**fields)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from types import MappingProxyType
 
 import numpy as np
@@ -68,6 +68,7 @@ class Look:
     prior: FiducialEstimate
     method: str
     acquired: Acquired | None
+    template: tuple[int, ...] = ()
 
     @property
     def measurement_id(self) -> int:
@@ -98,10 +99,13 @@ def look_at_fiducial(
     prior = calibration.estimate
     expectation = gate.around(prior)
     if not way.shifted:
-        acquired, measured = yield from measure_here(way.method, expectation, fresh=fresh)
+        template = calibration.template_of()
+        acquired, measured = yield from measure_here(
+            way.method, expectation, fresh=fresh, template=template
+        )
         _check_plane(measured, calibration.plane)
         found = estimate_from(measured, prior.setpoints_um)
-        return Look(measured, found, prior, way.method, acquired)
+        return Look(measured, found, prior, way.method, acquired, template)
     shifts_px = paper_random(np.random.default_rng(seed)).shifts_px
     result = yield from measure_shift_set(
         prior,
@@ -111,6 +115,7 @@ def look_at_fiducial(
         way.method,
         expectation,
         gate.noise,
+        calibration.template_of(),
     )
     _check_plane(result.measured, calibration.plane)
     return Look(result.measured, result.estimate, prior, way.method, None)
@@ -121,9 +126,11 @@ def look_longer(
 ) -> ProcedureSteps[Look]:
     """Look again with `frames` slices in all from the same hold."""
     expectation = gate.around(seen.prior)
-    more, measured = yield from measure_again(acquired, seen.method, expectation, frames=frames)
+    more, measured = yield from measure_again(
+        acquired, seen.method, expectation, frames=frames, template=seen.template
+    )
     found = estimate_from(measured, seen.prior.setpoints_um)
-    return Look(measured, found, seen.prior, seen.method, more)
+    return replace(seen, measured=measured, found=found, acquired=more)
 
 
 def _check_plane(measured: Measured, plane: ImagePlane) -> None:

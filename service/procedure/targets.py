@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from case_record.record import CaseRecord
 from case_record.rows import Event
+from service.procedure.calibration import Calibration, FoundBy
 from service.procedure.guide_geometry import GuideGeometry, state_on_line
 from service.procedure.kinematics import KinematicsError, line_from_entry_and_target
 from service.procedure.plane import ImagePlane
@@ -36,7 +37,8 @@ class Target:
     """patient_mm: LPS; `number` is that of the event by which it was set.
 
     frame: of the slices on which it was set, as of `frame_seq` in the order of the record; None:
-    before any slice, or in the record of an older program.
+    before any slice, or in the record of an older program. found_by: how the fiducial was found
+    there, where its own place is the target.
     """
 
     number: int
@@ -45,6 +47,7 @@ class Target:
     in_water: bool = False
     frame: ScanFrame | None = None
     frame_seq: int = field(default=0, compare=False)
+    found_by: FoundBy | None = None
 
 
 def current_target(record: CaseRecord) -> Target | None:
@@ -98,7 +101,25 @@ def target_of(event: Event) -> Target:
         event.body.get("in_water", False),
         None if frame is None else ScanFrame(**frame),
         event.body.get("scan_frame_seq", event.seq),
+        FoundBy.from_json(event.body["found_by"]) if "found_by" in event.body else None,
     )
+
+
+def common_part_mm(target: Target, start: Calibration) -> tuple[float, ...]:
+    """Std, for each coordinate, of what all places found as now have in common and counts here.
+
+    What the fiducial's middle is said to be cancels where the target is the same fiducial's own
+    place, found the same way; by another template of it, what the noise in both does is left. For
+    a place in tissue, or one that was found by other means than now, it counts in full.
+    """
+    then, now = target.found_by, start.found_by
+    if target.in_water:
+        return now.systematic_mm
+    if then is None or then.templates == now.templates:
+        return ()
+    if not then.templates or not now.templates:
+        return now.systematic_mm or then.systematic_mm
+    return tuple(float(np.hypot(a, b)) for a, b in zip(now.own_mm, then.own_mm, strict=True))
 
 
 def why_void_target(record: CaseRecord, target: Target) -> str:

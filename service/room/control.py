@@ -47,6 +47,7 @@ from service.room.execution import Execution, ProcedureAbortedError
 from service.room.integrity import doubt_of, doubt_of_arrival
 from service.room.link import RoomLink
 from service.room.readiness import ConflictError
+from service.room.scanner_clock import ClockWatch, note_step
 from service.room.state import RoomState
 from service.room.stop_latch import StopLatch
 from service.room.trouble import RECORD_FAULTS, Trouble, held
@@ -114,6 +115,7 @@ class ControlLoop:
         self._config = config
         self._cases = Cases(*config.room.folders)
         self._processes = ProcessLook(self._cases.home)
+        self._clock = ClockWatch(self._cases.home)
         self._unusable: Path | None = None
         self._problem = ""
         self._owed: list[tuple[Future[Any], Any]] = []
@@ -274,6 +276,8 @@ class ControlLoop:
         execution = Execution(self._config, record, self._link, self._tick)
         room = Room(self._config, record, self._link, execution, self._stops)
         self._record, self._execution = record, execution
+        if self._clock.is_news_to(record):
+            note_step(record, self._clock.stepped_s)
         self._describer = Describer(self._config, record, self._link, life, self._wrong)
         self._commands = Commands(room, life)
         self._publish()
@@ -300,6 +304,7 @@ class ControlLoop:
         self._commands = None
 
     def _publish_between(self, between: BetweenCases) -> None:
+        self._clock.look()
         robot = describe_robot(self._link, self._state.robot)
         processes = self._processes.processes()
 
@@ -413,6 +418,7 @@ class ControlLoop:
             "in_water": False,
             "procedure_id": recorded.procedure_id,
             "sigma_mm": place.to_json()["sigma_mm"],
+            "found_by": place.calibration.found_by.to_json(),
         }
         frame = frame_of(self._record, self._record.measurement(place.calibration.measurement_id))
         if frame is not None:
@@ -425,6 +431,8 @@ class ControlLoop:
             raise _Closing
         self._answer_queue()
         if self._publish_if_due():
+            if self._clock.look():
+                note_step(self._record, self._clock.stepped_s)
             self._keep_ready()
             if self._commands is not None:
                 self._commands.look_for_plans()

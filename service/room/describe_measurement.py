@@ -13,7 +13,7 @@ from dicom_slice.geometry import SliceGeometry
 from room_config.load import Config
 from service.procedure.estimate import axis_sigma, probability_within
 from service.procedure.registry import latest_calibration
-from service.procedure.targets import Target, fiducial_must_appear_at
+from service.procedure.targets import Target, common_part_mm, fiducial_must_appear_at
 from service.room.state import ErrorState, FiducialState, MeasurementState, ReconstructionState
 
 _LOOKED_BACK = 24
@@ -121,6 +121,9 @@ def describe_error(config: Config, record: CaseRecord, target: Target | None) ->
     )
     offset = must_be - np.array(last.result["plane_mm"])
     covariance = np.array(last.result["covariance_mm2"])
+    common_mm = common_part_mm(target, calibration)
+    if len(common_mm) == len(covariance):
+        covariance = covariance + np.diag(np.square(common_mm))
     spacing = np.array(calibration.plane.spacing_mm)
     target_px = np.array(last.result["centre_px"]) + offset / spacing
     return ErrorState(

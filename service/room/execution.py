@@ -33,8 +33,8 @@ from service.room.going_on import GO_ON, Permitted
 from service.room.link import RoomLink
 from service.room.measuring import measure_request, measured_from_result
 from service.room.present import RESTS_ON, bridge_facts, rests_on, why_stood_no_more
-from service.room.scanner_clock import clock_margin_s
-from sr_engine.worker import is_at_position
+from service.room.scanner_clock import clock_margin_s, is_by_another_clock
+from sr_engine.request import is_at_position
 
 _SERVICE = "service"
 _STOPPED_BY_PEOPLE = frozenset({Code.OPERATOR_STOP.value, Code.EMERGENCY_STOP.value})
@@ -289,6 +289,8 @@ class Execution:
         self._let_clocks_agree(hold)
         attempt = 0
         while True:
+            if is_by_another_clock(self._record, hold):
+                hold = self._hold_again(hold)
             missing = step.count - self._assigned(hold, step.slice_position_mm)
             if missing <= 0:
                 break
@@ -308,6 +310,22 @@ class Execution:
         self.request = None
         return Acquired(hold.hold_id, step.count)
 
+    def _hold_again(self, hold: Hold) -> Hold:
+        """The same hold by the clock as it is now; the robot stands where it stood."""
+        now_s = time.time()
+        with self._record.transaction():
+            self._record.end_open_hold(now_s)
+            return self._record.begin_hold(
+                set_id=hold.set_id,
+                place=hold.place,
+                setpoints_um=hold.setpoints_um,
+                readback_um=hold.readback_um,
+                shift_um=hold.shift_um,
+                shift_px=hold.shift_px,
+                settled_at_s=now_s,
+                bridge=hold.bridge,
+            )
+
     def _expect(self, hold: Hold, step: Acquire) -> None:
         """Tell the listener how many slices the hold has in all: those elsewhere come on top."""
         elsewhere = self._assigned(hold, None) - self._assigned(hold, step.slice_position_mm)
@@ -315,10 +333,12 @@ class Execution:
 
     def _let_clocks_agree(self, hold: Hold) -> None:
         """Ask for slices only when the hold is older than the scanner's clock is uncertain."""
-        now_s = time.time()
-        margin_s = clock_margin_s(self._config, self._record, now_s)
+        margin_s = clock_margin_s(self._config, self._record, time.time())
         wait_s = max(self._config.service.settle_s, margin_s)
-        while time.time() < hold.settled_at_s + wait_s:
+        began_s = time.monotonic()  # the other clock may be set meanwhile
+        if hold.settled_monotonic_s is not None and hold.settled_monotonic_s < began_s:
+            began_s = hold.settled_monotonic_s
+        while time.monotonic() < began_s + wait_s:
             self.prompt = "Waiting for the robot to settle before the next slice."
             self._wait()
 
@@ -336,6 +356,8 @@ class Execution:
             assigned = self._assigned(hold, slice_position_mm)
             aside = self._record.count_slices_after(last_id, "quarantined")
             if assigned >= wanted or (aside and assigned + aside >= wanted):
+                return
+            if is_by_another_clock(self._record, hold):
                 return
             self._wait()
 

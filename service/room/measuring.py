@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from service.procedure.steps import Measure, Measured
+from service.procedure.steps import Measure, Measured, seen_before
 
 
 def measure_request(
@@ -20,6 +20,8 @@ def measure_request(
     region_px: where to look while nothing is known of the fiducial's place.
     """
     expected = step.expected_plane_mm
+    template = {"template": list(step.template)} if step.template else {}
+    any_shape = {"any_shape": True} if step.any_shape else {}
     return {
         "holds": [{"hold_id": h.hold_id, "shift_mm": list(h.shift_mm)} for h in step.holds],
         "expected_plane_mm": None if expected is None else list(expected),
@@ -28,6 +30,8 @@ def measure_request(
         "slice_position_mm": step.slice_position_mm,
         "radius_mm": list(radius_mm),
         "region_px": None if region_px is None else list(region_px),
+        **template,
+        **any_shape,
     }
 
 
@@ -42,4 +46,13 @@ def measured_from_result(measurement_id: int, result: Mapping[str, Any]) -> Meas
         plane=result["plane"],
         frames=result["n_frames"],
         scan_s=result["scan_s"],
+        method=result.get("method", ""),
+        systematic_mm=_pair(result.get("systematic_mm")),
+        own_mm=_pair(result.get("template", {}).get("sigma_mm")),
+        views=tuple(seen_before(view) for view in result.get("template", {}).get("views", ())),
     )
+
+
+def _pair(values: list[float] | None) -> tuple[float, float]:
+    row, col = values or (0.0, 0.0)
+    return row, col

@@ -1,15 +1,28 @@
-"""What is known of the scanner's clock, since when, and what that means for slices."""
+"""What is known of the scanner's clock, since when, and what that means for slices.
+
+A comparison is between two clocks: where this computer's own one is set, nothing is known any more.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import json
+import os
+import time
+from pathlib import Path
 from typing import Any
 
 from case_record.record import CaseRecord
-from case_record.rows import Event
+from case_record.rows import Event, Hold
 from dicom_listener.clock import ClockRules
 from room_config.load import Config
+from service.room.alarms import Condition
+from service.room.present import computer_start
 from service.room.state import ClockState
 
+CLOCK_COMPARED, CLOCK_FORGOTTEN = "clock_sync", "clock_reset"
+# by less the margins between a hold and its slices allow for
+_STEP_S = 0.1
 _WAITS = "slices are pending: compare the clocks, or confirm the hold at which each was acquired"
 
 
@@ -27,6 +40,8 @@ def implied(config: Config, compared: ClockState | None, now_s: float) -> str:
             return f"Not compared, and no delay has been measured here: {_WAITS}."
         return f"Not compared: slices are judged by the delay measured here, at most {most_s:g} s."
     ends_s = _made_s(compared) + 60 * config.listener.comparison_valid_min
+    if now_s < ends_s and most_s is None and config.listener.clock_may_be_set:
+        return f"Valid for the hold at which it was made. For others, {_WAITS}."
     if now_s < ends_s:
         wait_s = start_margin_s(config, compared, now_s)
         return f"Used for slices acquired {wait_s:.1f} s or more after the robot settled."
@@ -84,3 +99,88 @@ def _from_file(config: Config) -> ClockState | None:
         compared_s=listener.clock_compared_at.timestamp(),
         who="the room's file",
     )
+
+
+class ClockWatch:
+    """Whether somebody, or a time service, sets this computer's clock: also between two cases, or
+    while the service is restarted (`home / clock.json`). Slewing moves both clocks alike.
+
+    stepped_s, at_monotonic_s: by how much it was set last, and when.
+    """
+
+    def __init__(self, home: Path) -> None:
+        self._path = home / "clock.json"
+        self._offset_s = _wall_less_steady_s()
+        self.stepped_s = self.at_monotonic_s = 0.0
+        with contextlib.suppress(OSError, ValueError, KeyError, TypeError):
+            kept = json.loads(self._path.read_text(encoding="utf-8"))
+            if kept.pop("computer") == computer_start():
+                self._offset_s = float(kept["offset_s"])
+                self.stepped_s = float(kept["stepped_s"])
+                self.at_monotonic_s = float(kept["at_monotonic_s"])
+        self._keep()
+
+    def look(self) -> bool:
+        """True once for each step."""
+        step_s = _wall_less_steady_s() - self._offset_s
+        if not abs(step_s) > _STEP_S:
+            return False
+        self._offset_s += step_s
+        self.stepped_s, self.at_monotonic_s = step_s, time.monotonic()
+        self._keep()
+        return True
+
+    def is_news_to(self, record: CaseRecord) -> bool:
+        """Whether the clock was set since the case was told anything of comparisons."""
+        told = (record.last_event(kind) for kind in (CLOCK_COMPARED, CLOCK_FORGOTTEN))
+        last_s = max((_told_s(event) for event in told if event), default=0.0)
+        return bool(self.stepped_s) and last_s < self.at_monotonic_s
+
+    def _keep(self) -> None:
+        kept = {"offset_s": self._offset_s, "stepped_s": self.stepped_s}
+        kept |= {"at_monotonic_s": self.at_monotonic_s}
+        part = self._path.with_suffix(".part")
+        with contextlib.suppress(OSError):  # of a disk that takes nothing
+            part.write_text(json.dumps({"computer": computer_start(), **kept}), encoding="utf-8")
+            os.replace(part, self._path)
+
+
+def _told_s(event: Event) -> float:
+    """When the clocks were compared, which may have been in the case before."""
+    return float(event.body.get("monotonic_s", event.monotonic_s))
+
+
+def _wall_less_steady_s() -> float:
+    """The steady clock goes on while the computer sleeps, and nobody sets it."""
+    before_s = time.clock_gettime(time.CLOCK_BOOTTIME)
+    wall_s = time.time()
+    return wall_s - (before_s + time.clock_gettime(time.CLOCK_BOOTTIME)) / 2
+
+
+def note_step(record: CaseRecord, step_s: float) -> None:
+    """Of the comparison nothing is left; slices wait, or are judged by the delay measured here."""
+    body = {"why": f"the room computer's clock was set by {step_s:+.1f} s", "step_s": step_s}
+    record.append_event(CLOCK_FORGOTTEN, body, source="service")
+
+
+def clock_was_set(config: Config, record: CaseRecord) -> list[Condition]:
+    """That the computer's clock was set, until it is compared again."""
+    step = _last_step(record)
+    if step is None:
+        return []
+    waits = "" if config.listener.prompt_delay_s is not None else ": slices stay pending"
+    text = f"{step.body['why'][:1].upper()}{step.body['why'][1:]}{waits}"
+    return [Condition("clock_set", "alarm", text, "Compare it with the scanner's clock.")]
+
+
+def _last_step(record: CaseRecord) -> Event | None:
+    forgotten, compared = record.last_event(CLOCK_FORGOTTEN), record.last_event(CLOCK_COMPARED)
+    if forgotten is None or "step_s" not in forgotten.body:
+        return None
+    return None if compared is not None and compared.seq > forgotten.seq else forgotten
+
+
+def is_by_another_clock(record: CaseRecord, hold: Hold) -> bool:
+    """Whether the clock was set since the hold began: its instants are not the slices' then."""
+    forgotten = record.last_event(CLOCK_FORGOTTEN)
+    return forgotten is not None and "step_s" in forgotten.body and forgotten.seq > hold.begun_seq

@@ -19,9 +19,9 @@ _STEPS = (
     "Arm the robot.",
     "Start the calibration; the virtual scanner answers each request by itself.",
     "Pick target: click on the slice, then Set target{entry}.",
-    "Start the approach. Read each move, then CONFIRM MOVE, until READY.",
-    "Record the puncture; then Needle withdrawn.",
-    "Report, in the card Case.",
+    "Start the approach. Check each move, then CONFIRM MOVE, until READY.",
+    "Record the puncture, then click Needle withdrawn.",
+    "Open the report from the Case card.",
 )
 
 
@@ -34,8 +34,8 @@ def attend_room(room: DemoRoom, note: Callable[[str], None]) -> None:
     entry = ", and Set entry point on another slice" if room.options.guide else ""
     for number, step in enumerate(_STEPS, start=1):
         note(f"{number}. {step.format(entry=entry)}")
-    note("STOP (or Esc) works at any time. Ctrl-C here ends the room.")
-    note(f"faults, switched on and off by typing a name here: {', '.join(FAULTS)}")
+    note("STOP (or Esc) works at any time. Ctrl-C here closes the room.")
+    note(f"faults: type a name here to switch one on or off: {', '.join(FAULTS)}")
     switches = FaultSwitches(room, note)
     lines = _lines_of_stdin()
     while True:
@@ -59,7 +59,7 @@ class FaultSwitches:
         if not name:
             return
         if name not in FAULTS:
-            self._note(f"there is no fault {name!r}; there are: {', '.join(FAULTS)}")
+            self._note(f"unknown fault {name!r}; known: {', '.join(FAULTS)}")
             return
         self._on ^= {name}
         fresh = self._path.with_suffix(".part")

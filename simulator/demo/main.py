@@ -21,7 +21,7 @@ from case_record.record import CaseRecord
 from room_config.exit_codes import BAD_INPUT, COULD_NOT, INTERRUPTED
 from service.cli.children import ChildError, quiet_environment
 from service.client import RoomClient
-from simulator.config import parse_virtual_room
+from simulator.config import FiducialKind, parse_virtual_room
 from simulator.demo.attended import attend_room
 from simulator.demo.operator import WHO, DemoFailedError, Operator
 from simulator.demo.room import DemoOptions, DemoRoom, known_faults
@@ -38,27 +38,31 @@ class _Ended(Exception):
 
 @app.command()
 def demo(
-    exit_: Annotated[bool, typer.Option("--exit", help="Leave at once when done.")] = False,
+    exit_: Annotated[bool, typer.Option("--exit", help="Exit when done.")] = False,
     json_: Annotated[bool, typer.Option("--json", help="Print the results as JSON.")] = False,
-    punctures: Annotated[int, typer.Option(min=1, help="How many punctures.")] = 3,
-    seed: Annotated[int, typer.Option(min=0, help="Of physics and targets.")] = 0,
+    punctures: Annotated[int, typer.Option(min=1, help="Number of punctures.")] = 3,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of physics and targets.")] = 0,
     case: Annotated[
-        Path | None, typer.Option(help="Case folder, kept; goes on where it stands.")
+        Path | None, typer.Option(help="Case folder to keep; an existing case is continued.")
     ] = None,
     fault: Annotated[
         list[str] | None, typer.Option(help=f"One of: {', '.join(known_faults())}.")
     ] = None,
     guide: Annotated[
-        bool, typer.Option("--guide", help="Two fiducials and four axes: the needle's tip.")
+        bool, typer.Option("--guide", help="Two fiducials and four axes, steering the needle tip.")
     ] = False,
-    page_port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 0,
-    dicom_port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free one.")] = 0,
+    fiducial: Annotated[
+        FiducialKind,
+        typer.Option(help="Slightly oval with a cannula's void, or a plain sphere."),
+    ] = "cannulated",
+    page_port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free port.")] = 0,
+    dicom_port: Annotated[int, typer.Option(min=0, max=65535, help="0: any free port.")] = 0,
     attended: Annotated[
         bool,
-        typer.Option("--attended", help="You operate the room yourself, on its page."),
+        typer.Option("--attended", help="Operate the room yourself, on its page."),
     ] = False,
     tokens: Annotated[
-        bool, typer.Option("--tokens", help="Ask for a token, as a room on a network does.")
+        bool, typer.Option("--tokens", help="Require a token, as a room on a network does.")
     ] = False,
 ) -> int:
     """The whole room, virtual: calibration and punctures, unattended or by you on the page."""
@@ -66,7 +70,8 @@ def demo(
     for name in fault or ():
         if name not in known_faults():
             print(
-                f"autospine: no fault {name!r}; known: {', '.join(known_faults())}", file=sys.stderr
+                f"autospine: unknown fault {name!r}; known: {', '.join(known_faults())}",
+                file=sys.stderr,
             )
             return BAD_INPUT
     folder = case or Path(tempfile.mkdtemp(prefix="autospine-demo-"))
@@ -83,6 +88,7 @@ def demo(
             tokens=tokens,
             guide=guide,
             attended=attended,
+            fiducial=fiducial,
         )
         if attended:
             code = attend(DemoRoom(options))
@@ -124,7 +130,8 @@ def _run(room: DemoRoom, punctures: int, *, leave: bool, as_json: bool) -> int:
         _stand_still(room, operator, screen)
         print(f"autospine: {error}", file=sys.stderr)
         print(
-            f"autospine: the robot stands; go on with: autospine demo --case {room.folder}",
+            "autospine: the robot stands still; continue with: autospine demo --case "
+            f"{room.folder}",
             file=sys.stderr,
         )
         return COULD_NOT

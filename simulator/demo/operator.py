@@ -254,4 +254,4 @@ class Operator:
             order(*arguments)
         except RefusedByServiceError as error:
             if error.status != _NOT_NOW:
-                raise DemoFailedError(f"the service refused an order: {error}") from error
+                raise DemoFailedError(f"the service refused a command: {error}") from error

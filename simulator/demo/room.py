@@ -18,7 +18,7 @@ from room_config.exit_codes import BAD_INPUT
 from room_config.shell import autospine
 from service.cli.children import ChildError, Family
 from service.web.access import new_token, token_hash
-from simulator.config import VirtualRoom, parse_virtual_room
+from simulator.config import CANNULATED, FiducialKind, VirtualRoom, parse_virtual_room
 from simulator.faults import FAULTS
 from simulator.truth_client import TruthAddress, TruthError, ask_where
 
@@ -34,7 +34,8 @@ class DemoOptions:
     """What the user chose; port 0 means any free one.
 
     tokens: the room asks for tokens. guide: two fiducials and four axes. attended: a person
-    operates it on the page, which asks before every move.
+    operates it on the page, which asks before every move. fiducial: slightly oval, with the void
+    of the cannula that goes through it, or a sphere.
     """
 
     case_dir: Path
@@ -46,6 +47,7 @@ class DemoOptions:
     tokens: bool = False
     guide: bool = False
     attended: bool = False
+    fiducial: FiducialKind = "cannulated"
 
 
 class PortInUseError(Exception):
@@ -118,10 +120,10 @@ class DemoRoom:
         try:
             while ask_where(address).moving:
                 if time.monotonic() > deadline_s:
-                    return f"the stages still moved after {timeout_s:.0f} s"
+                    return f"the stages were still moving after {timeout_s:.0f} s"
                 time.sleep(0.05)
         except TruthError:
-            return "the emulated motors are gone; nothing can move"
+            return "the emulated motors have ended; nothing can move"
         return "the stages stand still"
 
     def _motors_words(self) -> list[str]:
@@ -173,11 +175,14 @@ class DemoRoom:
                 **({"token_file": str(self._token_file)} if self.options.tokens else {}),
             },
         }
+        shape = CANNULATED if self.options.fiducial == "cannulated" else {}
+        fiducials: list[dict[str, Any]] = [dict(shape)]
         if self.options.guide:
-            self.virtual_table["fiducials"] = [
-                {"name": name, "mount": "guide", "along_guide_mm": along_mm}
+            fiducials = [
+                {"name": name, "mount": "guide", "along_guide_mm": along_mm, **shape}
                 for name, along_mm in (("upper", UPPER_ALONG_MM), ("lower", LOWER_ALONG_MM))
             ]
+        self.virtual_table["fiducials"] = fiducials
         virtual = parse_virtual_room(self.virtual_table)
         line = self.virtual_dir / "line-service"
         tables = {

@@ -103,9 +103,9 @@ def test_a_file_that_is_no_lens_is_named(tmp_path, text):
 
 def test_a_slice_that_does_not_fit_or_has_no_scale_is_refused(scene, lens):
     big = parse_camera({**CONFIG, "shape": [400, 400]})
-    with pytest.raises(CameraConfigError, match="does not fit into the picture"):
+    with pytest.raises(CameraConfigError, match="does not fit in the picture"):
         Resampler(big, scene.camera.shape, None)
-    with pytest.raises(CameraConfigError, match="the scale is not known"):
+    with pytest.raises(CameraConfigError, match="the scale is unknown"):
         Resampler(parse_camera({"source": "0"}), scene.camera.shape, None)
     with pytest.raises(CameraConfigError, match="the lens file is for pictures of 640 x 480"):
         Resampler(parse_camera(CONFIG), (720, 1280), lens)
@@ -191,7 +191,7 @@ def test_a_video_is_a_camera_until_it_ends(scene, tmp_path):
         assert first.picture.shape == (480, 640, 3)
         redness = colour_plane(first.picture, "redness")
         assert redness.max() > 100, "RGB, and red"
-        with pytest.raises(CameraError, match="there are no more pictures"):
+        with pytest.raises(CameraError, match="no more pictures"):
             source.exposed_after(time.time() + 60, 1)
         assert source.newest is not None
         assert source.newest.number == 20

@@ -108,8 +108,9 @@ def _set_time(data_set: FileDataset, began_s: float) -> None:
     data_set.AcquisitionDuration = 0.5
 
 
-# somebody has compared the clocks, which are equal, when the room's file was written
-COMPARED = {"clock_offset_s": 0.0, "clock_uncertainty_s": 0.1}
+# somebody has compared the clocks, which are equal, when the room's file was written, and nobody
+# sets them
+COMPARED = {"clock_offset_s": 0.0, "clock_uncertainty_s": 0.1, "clock_may_be_set": False}
 
 
 def write_room(folder: Path, **listener: Any) -> Path:

@@ -91,6 +91,18 @@ def test_where_the_clock_is_not_known_a_slice_waits_if_a_hold_was_open_when_it_c
     assert why(decide(offset=unknown, holds=gone)) == Reason.NO_HOLD
 
 
+def test_where_the_clock_may_have_been_set_unseen_a_slice_waits_for_another_comparison():
+    waiting = decide(offset=replace(SAME_CLOCK, low_if_set_s=-20.0))
+    assert isinstance(waiting, Pending)
+    assert why(waiting) == Reason.CLOCK_UNKNOWN
+    assert "not been compared since hold 1 settled" in waiting.text
+    assert isinstance(decide(offset=replace(SAME_CLOCK, low_if_set_s=-9.9)), Assigned)
+    before = replace(STANDING, settled_at_s=1000.5)
+    assert why(decide(holds=[before], offset=replace(SAME_CLOCK, low_if_set_s=0.6))) == (
+        Reason.OUTSIDE_HOLD
+    )
+
+
 def test_a_slice_from_the_future_or_from_long_ago_shows_a_clock_that_jumped():
     assert why(decide(received_s=999.0)) == Reason.FUTURE
     assert why(decide(received_s=1500.0)) == Reason.LATE
@@ -209,17 +221,31 @@ troubles = st.builds(
     unnumbered=st.booleans(),
     no_duration=st.sampled_from((0.0, 0.2, 1.0)),
     estimated=st.sampled_from((0.0, 0.3, 1.0)),
+    synchronizes=st.booleans(),
 )
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(trouble=troubles, seed=st.integers(0, 2**32), n_holds=st.integers(1, 8))
 def test_no_slice_is_ever_used_for_a_hold_at_which_it_was_not_acquired(trouble, seed, n_holds):
+    trouble = one_at_a_time(trouble, is_held_up=seed % 3 == 0)
     outcome = VirtualDay(random.Random(seed), trouble).run(n_holds)
     assert outcome.wrong == []
 
 
-def any_trouble(dice: random.Random, knowledge: str, *, unseen_steps: bool = False) -> Trouble:
+def one_at_a_time(trouble: Trouble, *, is_held_up: bool) -> Trouble:
+    """Promptness was measured: it may fail, or the clock may be set; not both on one day."""
+    if trouble.knowledge not in ("promptness", "both"):
+        return trouble
+    return replace(trouble, steps=0) if is_held_up else replace(trouble, held_up=0.0)
+
+
+def any_trouble(dice: random.Random, knowledge: str) -> Trouble:
+    trouble = all_troubles(dice, knowledge)
+    return one_at_a_time(trouble, is_held_up=dice.random() < 0.3)
+
+
+def all_troubles(dice: random.Random, knowledge: str) -> Trouble:
     return Trouble(
         knowledge=knowledge,
         delays=dice.choice(DELAYS),
@@ -233,7 +259,7 @@ def any_trouble(dice: random.Random, knowledge: str, *, unseen_steps: bool = Fal
         unnumbered=dice.random() < 0.3,
         no_duration=dice.choice((0, 0, 0.2, 1)),
         estimated=dice.choice((0, 0, 0.3, 1)),
-        unseen_steps=unseen_steps,
+        synchronizes=dice.random() < 0.3,
     )
 
 
@@ -243,6 +269,8 @@ class Campaign:
 
     assigned: int = 0
     good: int = 0
+    holds: int = 0
+    filled: int = 0
     wrong: list[str] = field(default_factory=list)
 
     @property
@@ -251,12 +279,14 @@ class Campaign:
         return (self.assigned - len(self.wrong)) / self.good
 
 
-def campaign(knowledge: str, n_days: int, first_seed: int, **trouble: bool) -> Campaign:
+def campaign(knowledge: str, n_days: int, first_seed: int, troubles=any_trouble) -> Campaign:
     sums = Campaign()
     for seed in range(first_seed, first_seed + n_days):
         dice = random.Random(seed)
-        day = VirtualDay(dice, any_trouble(dice, knowledge, **trouble))
+        day = VirtualDay(dice, troubles(dice, knowledge))
         outcome = day.run(dice.randint(1, 8))
+        sums.holds += len(day.holds)
+        sums.filled += outcome.filled
         sums.assigned += outcome.assigned
         sums.good += outcome.good
         sums.wrong += [f"seed {seed}: {text}" for text in outcome.wrong]
@@ -265,7 +295,7 @@ def campaign(knowledge: str, n_days: int, first_seed: int, **trouble: bool) -> C
 
 @pytest.mark.parametrize("knowledge", ["comparison", "promptness", "both"])
 def test_a_short_campaign_of_bad_days_assigns_much_and_nothing_wrongly(knowledge):
-    sums = campaign(knowledge, 300, first_seed=0)
+    sums = campaign(knowledge, 200, first_seed=0)
     assert sums.wrong == []
     assert sums.share > 0.15
 
@@ -284,17 +314,19 @@ def test_with_neither_a_comparison_nor_a_measured_promptness_nothing_is_assigned
 def test_two_hundred_thousand_bad_days_assign_nothing_wrongly(knowledge, n_days):
     sums = campaign(knowledge, n_days, first_seed=10_000)
     print(
-        f"{knowledge}: {n_days} days, {sums.assigned} assigned, {sums.share:.1%} of the good ones"
+        f"{knowledge}: {n_days} days, {len(sums.wrong)} of {sums.assigned} assigned wrongly; used "
+        f"{sums.share:.1%} of the good slices; complete {sums.filled / sums.holds:.1%} of the holds"
     )
     assert sums.wrong == []
 
 
 @pytest.mark.soak
-def test_what_a_comparison_alone_leaves_open_is_as_rare_as_the_docs_say():
-    """A clock set forward by less than a slice takes to come, and an operator who was early."""
-    sums = campaign("comparison", 20_000, first_seed=10_000, unseen_steps=True)
-    print(f"{len(sums.wrong)} of {sums.assigned} wrong")
-    assert 0 < len(sums.wrong) < 0.005 * sums.assigned
+@pytest.mark.parametrize("knowledge", ["promptness", "both"])
+def test_slices_that_are_held_up_while_the_clock_is_set_are_rarely_taken_for_prompt_ones(knowledge):
+    """What measured promptness leaves open, as the docs say: less than 1 of 10,000 assignments."""
+    sums = campaign(knowledge, 20_000, 10_000, all_troubles)
+    print(f"{knowledge}: {len(sums.wrong)} of {sums.assigned} assigned wrongly")
+    assert len(sums.wrong) < 1e-4 * sums.assigned
 
 
 @pytest.mark.parametrize("knowledge", ["comparison", "promptness", "both"])
@@ -314,12 +346,12 @@ def test_the_generator_does_catch_an_assignment_that_is_too_trusting():
         def bounds_of(self, arrival):
             return OffsetBounds(self.first_offset_s, self.first_offset_s)
 
-    wrong = 0
-    for seed in range(100):
+    def is_wrong(seed: int) -> bool:
         dice = random.Random(seed)
-        trouble = replace(any_trouble(dice, "comparison"), steps=3, early=0.5, unseen_steps=True)
-        wrong += len(Trusting(dice, trouble).run(6).wrong)
-    assert wrong > 0
+        trouble = replace(any_trouble(dice, "comparison"), steps=3, early=0.5)
+        return bool(Trusting(dice, trouble).run(6).wrong)
+
+    assert any(is_wrong(seed) for seed in range(100))
 
 
 def test_the_generator_does_catch_a_promptness_that_nobody_measured():
@@ -329,9 +361,9 @@ def test_the_generator_does_catch_a_promptness_that_nobody_measured():
         def commissioned(self):
             return Promptness(0.0, 3.0)
 
-    wrong = 0
-    for seed in range(300):
+    def is_wrong(seed: int) -> bool:
         dice = random.Random(seed)
         trouble = replace(any_trouble(dice, "promptness"), delays="regular", early=0.5)
-        wrong += len(Assuming(dice, trouble).run(6).wrong)
-    assert wrong > 0
+        return bool(Assuming(dice, trouble).run(6).wrong)
+
+    assert any(is_wrong(seed) for seed in range(300))

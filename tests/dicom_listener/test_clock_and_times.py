@@ -19,7 +19,7 @@ from pydicom.sequence import Sequence
 from dicom_listener.clock import (
     ClockRules,
     Comparison,
-    Drift,
+    OffsetBounds,
     OffsetUnknown,
     Promptness,
     Received,
@@ -27,7 +27,7 @@ from dicom_listener.clock import (
     observe,
 )
 from dicom_listener.promptness import TooFewDelaysError, promptness_of
-from dicom_listener.scanner_clocks import ScannerClocks
+from dicom_listener.scanner_clocks import Drift, ScannerClocks
 from dicom_slice.elements import Elements, frame_elements
 from dicom_slice.header import slices_of
 from dicom_slice.times import (
@@ -308,7 +308,20 @@ def test_with_comparison_and_promptness_an_acquisition_must_be_good_by_both():
     held_up = Received(acquired(1010.0), 1012.0 + 50.0)
     seen = observe(clock, held_up, MEASURED)
     assert "no slice arrived later than 3.0 s when this was measured" in seen.unlike
-    assert seen.clock.bounds_for(held_up, MEASURED).low_s == pytest.approx(-0.1, abs=0.1)
+    # then it is the comparison alone that counts
+    alone = seen.clock.bounds_for(held_up, MEASURED)
+    assert alone.low_s == pytest.approx(-0.1, abs=0.1)
+    assert alone.low_if_set_s is not None
+
+
+def test_a_slice_that_was_held_up_while_the_clock_was_set_back_is_not_taken_for_a_prompt_one():
+    """Those after it agree with each other, and not with the clock that it was acquired by."""
+    held_up = Received(acquired(1000.0), 1080.0)
+    prompt = [Received(acquired(1060.0 + 5 * k - 18.0), 1064.0 + 5 * k) for k in range(6)]
+    clock = after(ScannerClock(), held_up, *prompt, rules=MEASURED)
+    assert isinstance(clock.bounds_for(prompt[-1], MEASURED), OffsetBounds)
+    unknown = clock.bounds_for(held_up, MEASURED)
+    assert "no slice arrived later than 3.0 s when this was measured: scan again" in unknown.text
 
 
 def test_a_clock_set_forward_stops_everything_until_the_clocks_are_compared():
@@ -345,7 +358,8 @@ def test_a_slice_that_comes_much_sooner_than_all_before_it_is_suspicious():
     assert "5.0 s sooner after its acquisition than any of the 6 slices before it" in seen.jump
     assert isinstance(seen.clock.bounds_for(sooner, RULES), OffsetUnknown)
     agreed = seen.clock.compared(Comparison(0.0, 0.1, 1320.0), RULES)
-    assert agreed.bounds_for(sooner, RULES).low_s == pytest.approx(-0.1, abs=0.1)
+    # the first comparison, which is older, counts as well
+    assert agreed.bounds_for(sooner, RULES).low_s == pytest.approx(-0.1 - 317.0 * 500e-6)
 
 
 def test_a_wrong_duration_is_called_one_and_takes_nothing_from_the_clock():
@@ -364,6 +378,29 @@ def test_a_comparison_does_not_hold_for_a_slice_that_came_sooner_than_it_allows(
     unknown = later.bounds_for(Received(acquired(1000.0), 1070.0), RULES)
     assert isinstance(unknown, OffsetUnknown)
     assert "sooner than the comparison allows" in unknown.text
+
+
+def test_a_comparison_alone_does_not_say_that_the_clock_was_not_set_forward_since():
+    """By less than the slice took to come; the acquisition may have begun before its own time."""
+    clock, slice_ = compared(0.0, at_s=1000.0), Received(acquired(1100.0), 1103.0)
+    assert clock.bounds_for(slice_, RULES).low_if_set_s == pytest.approx(-100.0)
+    # it is not older than any slice may be
+    later = Received(acquired(1500.0), 1503.0)
+    assert clock.bounds_for(later, RULES).low_if_set_s == pytest.approx(1.0 - 120.0)
+    again = clock.compared(Comparison(0.0, 0.1, 1101.0), RULES)
+    assert again.bounds_for(slice_, RULES).low_if_set_s == pytest.approx(1.0)
+    assert clock.bounds_for(slice_, replace(RULES, unseen_steps=False)).low_if_set_s is None
+    assert clock.bounds_for(slice_, MEASURED).low_if_set_s is None
+
+
+def test_a_clock_that_followed_a_reference_when_it_was_compared_is_not_set_unseen():
+    slice_ = Received(acquired(1100.0), 1103.0, synchronized=True)
+    assert after(compared(0.0), slice_).bounds_for(slice_, RULES).low_if_set_s is not None
+    before = after(ScannerClock(), Received(acquired(990.0), 993.0, synchronized=True))
+    followed = after(before.compared(Comparison(0.0, 0.1, 1000.0), RULES), slice_)
+    assert followed.bounds_for(slice_, RULES).low_if_set_s is None
+    lost = after(followed, Received(acquired(1110.0), 1113.0), slice_)
+    assert lost.bounds_for(slice_, RULES).low_if_set_s is not None
 
 
 def test_a_clock_set_back_is_an_alarm_once_it_seems_too_late():

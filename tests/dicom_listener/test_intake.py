@@ -13,7 +13,7 @@ from pydicom.sequence import Sequence
 from real_slices import DICOM
 
 from case_record.record import CaseRecord
-from dicom_listener.clock import Comparison
+from dicom_listener.clock import ClockRules, Comparison
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope, sha256_of
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
@@ -108,8 +108,37 @@ def test_every_frame_of_one_object_is_a_slice_of_the_hold(make_desk):
     assert rows[1].header["geometry"]["position_mm"] == [-20, 15, 24]
 
 
-def test_a_stack_at_the_next_hold_must_lie_where_the_first_one_lay(make_desk):
+def test_a_flood_of_slices_that_wait_sets_the_oldest_aside_and_says_so_once(make_desk):
     desk = make_desk()
+    hold_id = begin_hold(desk.record, time.time() - 5, expected=1)
+    rows = desk.receive(enhanced(230, time.time() - 0.6))
+    waiting = [row.frame for row in rows if row.state == "pending"]
+    assert waiting == list(range(30, 230))
+    assert (rows[1].state, rows[1].reason_code) == ("quarantined", "not_expected")
+    assert rows[1].reason.startswith("more than 200 slices were pending (hold 1 expects 1 slices")
+    assert desk.alarms() == ["many_slices_wait"]
+    desk.record.expect_slices(hold_id, 2)
+    desk.record.end_open_hold(time.time() + 1.0)
+    desk.intake._decide_pending()
+    assert desk.record.slice(rows[30].slice_id).state == "assigned"
+    assert not desk.record.slices(state="pending")
+
+
+def test_a_slice_waits_for_the_clocks_no_longer_than_a_comparison_would_count(make_desk):
+    desk = make_desk(comparison=None)
+    begin_hold(desk.record, time.time() - 4000.0, expected=3)
+    long_ago_s = time.time() - 3610.0
+    old = mr_data_set("1.2.1", began_s=long_ago_s - 1.0)
+    (old_row,) = desk.receive(old, received_s=long_ago_s)
+    (new_row,) = desk.receive(mr_data_set("1.2.2", began_s=time.time() - 0.6))
+    old_row = desk.record.slice(old_row.slice_id)
+    assert (old_row.state, old_row.reason_code) == ("quarantined", "clock_unknown")
+    assert old_row.reason.startswith("it was pending too long: the clocks were not compared")
+    assert new_row.state == "pending"
+
+
+def test_a_stack_at_the_next_hold_must_lie_where_the_first_one_lay(make_desk):
+    desk = make_desk(clock=ClockRules(unseen_steps=False))
     begin_hold(desk.record, time.time() - 5, expected=1)
     desk.receive(mr_data_set("1.2.1", began_s=time.time() - 0.6))
     desk.record.end_open_hold(time.time())

@@ -57,7 +57,8 @@ def record(config):
 def send(port: int, *data_sets) -> list[int]:
     """Statuses of a C-STORE of each; -1 where no answer came."""
     ae = AE("SCANNER")
-    ae.add_requested_context(MR_IMAGE, [ExplicitVRLittleEndian])
+    for syntax in {str(d.file_meta.TransferSyntaxUID) for d in data_sets}:
+        ae.add_requested_context(MR_IMAGE, [syntax])
     association = mended(ae.associate("127.0.0.1", port, ae_title="AUTOSPINE"))
     assert association.is_established
     statuses = [association.send_c_store(d).get("Status", -1) for d in data_sets]
@@ -124,11 +125,15 @@ def test_the_same_slice_again_changes_nothing_and_other_bytes_under_its_uid_are_
 
 def test_a_surplus_slice_waits_until_the_hold_expects_it(config, record):
     hold_id = begin_hold(record, time.time() - 5.0, expected=1)
-    began_s = time.time() - 0.6
     with listening(config) as listener:
+        began_s = time.time() - 0.6
         send(listener.port, *(mr_data_set(f"1.2.9.{k}", began_s=began_s) for k in (1, 2, 3)))
-        states = [(row.state, row.reason_code) for row in rows(record, 3)]
-        assert states == [("assigned", "")] + [("pending", "not_expected")] * 2
+        found = rows(record, 3)
+        assert [(row.state, row.reason_code) for row in found] == [
+            ("assigned", ""),
+            ("pending", "not_expected"),
+            ("pending", "not_expected"),
+        ], [row.reason for row in found]
         record.expect_slices(hold_id, 2)
         wait_for(lambda: record.slices()[1].state == "assigned")
         assert record.slices()[2].state == "pending"
@@ -219,6 +224,23 @@ def test_after_a_comparison_no_earlier_slice_says_how_late_this_one_is(tmp_path,
         early.AcquisitionNumber, good.AcquisitionNumber = 2, 3
         send(listener.port, early, good)
         assert [row.state for row in rows(record, 3)][1:] == ["quarantined", "assigned"]
+
+
+def test_a_comparison_counts_at_the_hold_that_stood_and_a_slice_at_the_next_one_waits(
+    tmp_path, record
+):
+    config = write_room(tmp_path, **{**COMPARED, "clock_may_be_set": True})
+    with listening(config) as listener:
+        sync_clock(record, 0.0, 0.05, "anna")
+        hold_id = begin_hold(record, time.time())
+        began_s = time.time() + 0.3
+        wait_for(lambda: time.time() > began_s + 0.6)
+        send(listener.port, mr_data_set("1.2.1", began_s=began_s))
+        waiting = rows(record, 1)[0]
+        assert (waiting.state, waiting.reason_code) == ("pending", "clock_unknown")
+        assert f"not been compared since hold {hold_id} settled" in waiting.reason
+        sync_clock(record, 0.0, 0.05, "anna")
+        wait_for(lambda: record.slices()[0].hold_id == hold_id)
 
 
 def test_a_comparison_from_long_ago_holds_no_more_unless_the_scanner_is_synchronized(tmp_path):

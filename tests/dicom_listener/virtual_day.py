@@ -15,12 +15,11 @@ from dataclasses import dataclass, field, replace
 
 from listener_room import a_slice
 
-from dicom_listener.assign import Assigned, AssignRules, HoldWindow, Known, Pending, assign
+from dicom_listener.assign import Assigned, AssignRules, HoldWindow, Known, assign
 from dicom_listener.clock import (
     ClockRules,
     Comparison,
     Offset,
-    OffsetUnknown,
     Promptness,
     Received,
     ScannerClock,
@@ -28,9 +27,9 @@ from dicom_listener.clock import (
 )
 from dicom_listener.promptness import FEWEST_DELAYS, promptness_of
 from dicom_slice.header import Slice
+from dicom_slice.reasons import Reason
 from dicom_slice.times import AcquisitionInterval
 
-_LONGEST_DELAY_S = 300.0
 DELAYS = ("regular", "varied", "any", "series")
 KNOWLEDGE = ("comparison", "promptness", "both", "neither")
 
@@ -41,10 +40,8 @@ class Trouble:
 
     held_up: a slice comes up to two minutes later than is usual at this site.
     early: the operator starts before the robot stands.
-    steps: how often the scanner's clock is set, forward or back.
-    unseen_steps: with nothing but a comparison, the clock may go forward by less than a slice takes
-    to come. Nothing in a slice tells that from one that came sooner; only what was measured of the
-    site does, or another comparison. Without it, such a step is longer than any slice takes.
+    steps: how often the scanner's clock is set, forward or back, by little or much.
+    synchronizes: it follows a time server in the end, is not set any more, and slices say so.
     """
 
     knowledge: str = "comparison"
@@ -59,15 +56,19 @@ class Trouble:
     unnumbered: bool = False
     no_duration: float = 0.0
     estimated: float = 0.0
-    unseen_steps: bool = False
+    synchronizes: bool = False
 
 
 @dataclass
 class Outcome:
-    """good: slices that were acquired wholly at a standing hold which lacked one."""
+    """good: slices that were acquired wholly at a standing hold which lacked one.
+
+    filled: of the holds, how many have all their slices in the end.
+    """
 
     assigned: int = 0
     good: int = 0
+    filled: int = 0
     set_aside: dict[str, int] = field(default_factory=dict)
     wrong: list[str] = field(default_factory=list)
 
@@ -87,7 +88,7 @@ def delays_of_site(dice: random.Random, kind: str) -> Callable[[], float]:
         spread_s = min(usual_s, dice.uniform(0.05, 2.0))
         return lambda: usual_s + dice.uniform(-0.5, 0.5) * spread_s
     if kind == "varied":
-        return lambda: usual_s * dice.uniform(0.5, 1.5)
+        return lambda: min(120.0, usual_s * dice.uniform(0.5, 1.5))
     return lambda: 0.2 * 600 ** dice.random()
 
 
@@ -97,11 +98,11 @@ class VirtualDay:
     def __init__(self, dice: random.Random, trouble: Trouble) -> None:
         self.dice, self.trouble = dice, trouble
         self.delay_s = delays_of_site(dice, trouble.delays)
-        self.rules = AssignRules(guard_s=0.05, late_limit_s=120.0)
+        self.rules = AssignRules()
         promptness = None
         if trouble.knowledge in ("promptness", "both"):
             promptness = self.commissioned()
-        self.clock_rules = ClockRules(promptness=promptness, late_limit_s=120.0)
+        self.clock_rules = ClockRules(promptness=promptness)
         self.offset_s = dice.uniform(-300, 300)  # our clock - the scanner's
         self.first_offset_s = self.offset_s
         self.creep = dice.uniform(-1, 1) * trouble.creep_ppm * 1e-6
@@ -115,6 +116,7 @@ class VirtualDay:
         self.series: list[Arrival] = []
         self.step_times = sorted(dice.uniform(0, 300) for _ in range(trouble.steps))
         self.steps: list[tuple[float, float]] = []
+        self.synchronized_from_s = self.step_times[-1] if self.step_times else 0.0
         self.clock = ScannerClock()
 
     def commissioned(self) -> Promptness:
@@ -128,6 +130,7 @@ class VirtualDay:
             now_s += self.dice.uniform(0.3, 8.0)  # the robot moves
             now_s = self.stand(now_s, place)
         self.receive_until(now_s + 500, None)
+        self.outcome.filled = sum(self.count(h) >= h.expected_slices for h in self.holds)
         return self.outcome
 
     def compare(self, now_s: float) -> None:
@@ -190,11 +193,7 @@ class VirtualDay:
     def step_s(self) -> float:
         """By how much the offset changes: less than 0 where the scanner's clock goes forward."""
         size_s = self.dice.choice((0.3, 1.0, 5.0, 20.0, 60.0, 3600.0)) * self.dice.random()
-        if self.dice.random() < 0.5:
-            return size_s
-        if self.clock_rules.promptness is None and not self.trouble.unseen_steps:
-            return -(_LONGEST_DELAY_S + size_s)
-        return -size_s
+        return size_s if self.dice.random() < 0.5 else -size_s
 
     def scan(self, began_s: float, length_s: float) -> Arrival:
         self.number += 1
@@ -210,6 +209,7 @@ class VirtualDay:
             sop_instance_uid=f"1.2.{self.uid}",
             interval=AcquisitionInterval(from_s, end_s, "AcquisitionDateTime", estimated),
             acquisition_number=1 if self.trouble.unnumbered else self.number,
+            clock_synchronized=self.trouble.synchronizes and began_s > self.synchronized_from_s,
         )
         return Arrival(began_s, began_s + length_s, math.nan, slice_)
 
@@ -252,12 +252,20 @@ class VirtualDay:
 
     def received(self, arrival: Arrival) -> Received:
         assert arrival.slice.interval is not None
-        return Received(arrival.slice.interval, arrival.received_s)
+        return Received(
+            arrival.slice.interval, arrival.received_s, arrival.slice.clock_synchronized is True
+        )
 
     def decide(self, arrival: Arrival, number: int) -> None:
         known = [k for key, k in self.known.items() if key < number or k.hold_id is not None]
-        bounds = self.bounds_of(arrival)
-        decision = assign(arrival.slice, arrival.received_s, self.holds, known, bounds, self.rules)
+        decision = assign(
+            arrival.slice,
+            arrival.received_s,
+            self.holds,
+            known,
+            self.bounds_of(arrival),
+            self.rules,
+        )
         hold_id, code = None, ""
         if isinstance(decision, Assigned):
             hold_id = decision.hold_id
@@ -265,7 +273,7 @@ class VirtualDay:
         else:
             code = str(decision.code)
             assert decision.text
-            if isinstance(decision, Pending) and isinstance(bounds, OffsetUnknown):
+            if decision.code == Reason.CLOCK_UNKNOWN:
                 self.waiting[number] = number, arrival
             where = self.outcome.set_aside
             where[code] = where.get(code, 0) + 1

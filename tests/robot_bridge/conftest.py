@@ -4,13 +4,8 @@ from collections.abc import Iterator
 
 import pytest
 from bridge_room import BridgeRoom, bridge_room
-from hypothesis import HealthCheck, settings
 
 from simulator.serial_line import LineFaults
-
-# How long an example takes says more about what else the machine is doing than about our code.
-settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("patient")
 
 
 @pytest.fixture(scope="module")

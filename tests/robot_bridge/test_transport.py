@@ -91,8 +91,8 @@ def test_the_end_of_the_other_side_is_a_transport_error():
     assert line.read(0.1) == b"abc"
     assert line.read(0.01) == b""
     far.close()
-    with pytest.raises(TransportError, match="gone"):
+    with pytest.raises(TransportError, match="disconnected"):
         line.read(0.1)
-    with pytest.raises(TransportError, match="gone"):
+    with pytest.raises(TransportError, match="disconnected"):
         line.write(b"abc")
     line.close()

@@ -129,3 +129,13 @@ def calibrated(client: RoomClient) -> RoomState:
         client.start_calibration()
         state = wait_for(client.state, lambda s: s.calibrated and s.procedure is None, 120.0)
     return state
+
+
+def tidied(client: RoomClient) -> None:
+    """Nothing runs and no needle is in, whatever a test before has left of a shared room."""
+    state = client.state()
+    if state.procedure is not None:
+        client.abort()
+        state = wait_for(client.state, lambda s: s.procedure is None)
+    if state.robot.insertion_locked or state.ready:
+        client.needle_out()

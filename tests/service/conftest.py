@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 
 import pytest
-from attended_room import AttendedRoom, running_room
+from attended_room import AttendedRoom, running_room, tidied
 from browser import CHROMIUM, Complaints, running_browser
 from httpx._config import DEFAULT_TIMEOUT_CONFIG
 from offline_arguments import calibration_arguments
@@ -45,6 +45,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AttendedRoom]:
 @pytest.fixture
 def client(room: AttendedRoom) -> Iterator[RoomClient]:
     with RoomClient(room.url, by="tester") as talking:
+        tidied(talking)
         yield talking
 
 

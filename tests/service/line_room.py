@@ -51,6 +51,10 @@ confirm_moves = false
 """
 
 
+# what says where the fiducial is here fits nothing to images
+IMAGING = '[imaging]\nlocalization = "disc"\n'
+
+
 class LineClient(PumpedClient):
     """Lets the room do what it is asked for, in the control loop's thread, each time it pumps."""
 
@@ -67,7 +71,7 @@ class LineRoom:
     def __init__(
         self, folder: Path, more: str = "", seed: int = 1, *, many_cases: bool = False
     ) -> None:
-        text = _FILE.format(more=more)
+        text = _FILE.format(more=more if "[imaging]" in more else more + "\n" + IMAGING)
         if many_cases:
             text = text.replace('case_dir = "case"', 'cases_dir = "cases"')
         if "confirm_moves = true" in more:

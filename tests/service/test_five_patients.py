@@ -9,7 +9,7 @@ import contextlib
 import io
 import re
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pydicom
@@ -67,10 +67,6 @@ def screen(browser: Browser, hospital: Hospital) -> Iterator[Page]:
     page.close()
 
 
-def press(page: Page, words: str | re.Pattern[str]) -> None:
-    page.get_by_role("button", name=words, exact=isinstance(words, str)).first.click()
-
-
 def state_of(client: RoomClient) -> RoomState | None:
     """None while the service is being started again."""
     try:
@@ -81,6 +77,21 @@ def state_of(client: RoomClient) -> RoomState | None:
 
 def until(client: RoomClient, wanted, timeout_s: float = 180.0) -> RoomState:
     return wait_for(lambda: state_of(client), lambda s: s is not None and wanted(s), timeout_s)
+
+
+def press(page: Page, client: RoomClient, done: Callable[[RoomState], object], *words: str) -> None:
+    """Press the first of these buttons that is there, until what is wanted has come of it.
+
+    As a person does: a button that has just moved takes no click, and a page is drawn anew.
+    """
+    while not done(until(client, lambda s: True)):
+        for word in words:
+            button = page.get_by_role("button", name=word, exact=True).first
+            if button.is_visible():
+                with contextlib.suppress(PlaywrightTimeoutError):
+                    button.click(timeout=2000)
+                break
+        page.wait_for_timeout(300)
 
 
 def arm(page: Page, client: RoomClient) -> None:
@@ -114,7 +125,7 @@ def go_through(page: Page, client: RoomClient, done) -> RoomState:
 def begin(page: Page, client: RoomClient, label: str) -> str:
     expect(page.locator("#new-label")).to_be_visible()
     page.locator("#new-label").fill(label)
-    press(page, "Begin the case")
+    press(page, client, lambda s: s.case_folder, "Start the case")
     state = until(client, lambda s: s.case_folder and s.case and s.case.label == label)
     expect(page.locator("#room")).to_contain_text(label)
     assert state.calibrated is False
@@ -125,15 +136,14 @@ def begin(page: Page, client: RoomClient, label: str) -> str:
     return state.case_folder
 
 
-def start_calibration(page: Page) -> None:
+def start_calibration(page: Page, client: RoomClient) -> None:
     """In two steps: what will move is said before it does."""
-    press(page, "Start the calibration")
-    press(page, "Drive the stages – calibrate")
+    steps = ("Drive the stages – calibrate", "Start the calibration")
+    press(page, client, lambda s: s.procedure == "calibration" or s.calibrated, *steps)
 
 
 def calibrate(page: Page, client: RoomClient) -> None:
-    start_calibration(page)
-    until(client, lambda s: s.procedure == "calibration" or s.question is not None)
+    start_calibration(page, client)
     go_through(page, client, lambda s: s.procedure is None and s.calibrated)
 
 
@@ -143,24 +153,20 @@ def pick_and_approach(page: Page, client: RoomClient) -> None:
     assert state.measurement is not None
     assert state.measurement.centre_px is not None
     row, col = state.measurement.centre_px
-    press(page, "Pick target")
+    page.get_by_role("button", name="Pick target", exact=True).first.click()
     laid_out(page)
     box = page.locator(".view canvas").first.bounding_box()
     assert box is not None
     rows, cols = state.slice.shape
     x = box["x"] + (col + 2.5) * box["width"] / cols
     page.mouse.click(x, box["y"] + (row - 1.5) * box["height"] / rows)
-    press(page, "Set target")
-    until(client, lambda s: s.target_patient_mm is not None)
-    press(page, "Start the approach")
-    until(client, lambda s: s.procedure == "approach" or s.ready)
+    press(page, client, lambda s: s.target_patient_mm, "Set target")
+    press(page, client, lambda s: s.procedure == "approach" or s.ready, "Start the approach")
     go_through(page, client, lambda s: s.ready and s.robot.insertion_locked)
 
 
 def puncture(page: Page, client: RoomClient) -> None:
-    press(page, "Record the puncture")
-    press(page, "Record the puncture")
-    until(client, lambda s: s.punctured)
+    press(page, client, lambda s: s.punctured, "Record the puncture")
     unlock = page.get_by_role("button", name=re.compile("unlock", re.I))
     while until(client, lambda s: True).robot.insertion_locked:
         # two steps, the second elsewhere; a button that has just moved takes no click for a moment
@@ -170,9 +176,8 @@ def puncture(page: Page, client: RoomClient) -> None:
 
 
 def finish(page: Page, client: RoomClient) -> None:
-    press(page, "Finish the case …")
-    press(page, "Finish the case now")
-    until(client, lambda s: s.case_folder is None)
+    steps = ("Finish the case now", "Finish the case …")
+    press(page, client, lambda s: s.case_folder is None, *steps)
     expect(page.locator("#new-label")).to_be_visible()
 
 
@@ -182,7 +187,7 @@ def one_patient(
     folder = begin(page, client, label)
     arm(page, client)
     if killed:
-        start_calibration(page)
+        start_calibration(page, client)
         until(client, lambda s: s.robot.moving)
         hospital.kill("service")
         hospital.start_again("service")

@@ -3,7 +3,7 @@
 import time
 
 import pytest
-from line_room import patient_mm, running_line_room
+from line_room import IMAGING, patient_mm, running_line_room
 
 from case_record.record import CaseRecord, CaseRecordError
 from service.dicom_out.finding import finding_of_arrival
@@ -247,6 +247,44 @@ def test_a_case_that_has_ended_leaves_nothing_behind_even_if_it_is_opened_again(
         assert (state.error, state.measurement.lost.code) == (None, "case_ended")
         assert not state.calibrated
         assert standing(state).measurement is None
+
+
+@pytest.mark.parametrize("step_s", [3600, -3600, -5])
+def test_a_clock_that_is_set_while_slices_are_awaited_is_an_alarm_and_the_hold_begins_anew(
+    room, monkeypatch, step_s
+):
+    real = time.time
+    room.calibrate()
+    room.call("compare_clocks", offset_s=0.0, uncertainty_s=0.02)
+    room.do(lambda: setattr(room, "scanning", False))
+    room.call("set_target", patient_mm=patient_mm(41.0, 58.0))
+    room.call("start_approach")
+    before = room.until(lambda s: s.acquisition_request).acquisition_request.hold_id
+    monkeypatch.setattr(time, "time", lambda: real() + step_s)
+    state = room.until(lambda s: s.acquisition_request and s.acquisition_request.hold_id != before)
+    (alarm,) = [one for one in state.alarms if one.code == "clock_set"]
+    assert f"{step_s:+.1f} s" in alarm.text
+    assert state.clock is None  # the comparison was with the clock as it was before
+    assert state.hold.settled_at_s == pytest.approx(real() + step_s, abs=3)
+    room.do(lambda: setattr(room, "scanning", True))
+    room.run_to_end()
+    assert room.until(lambda s: s.ready)
+    room.call("compare_clocks", offset_s=0.0, uncertainty_s=0.02)
+    assert "clock_set" not in {one.code for one in room.later().alarms}
+
+
+def test_a_clock_that_was_set_between_two_cases_is_known_to_the_next_one(tmp_path, monkeypatch):
+    real = time.time
+    with running_line_room(tmp_path, many_cases=True) as room:
+        room.call("begin_case", label="anna", operator="", note="")
+        room.call("compare_clocks", offset_s=0.0, uncertainty_s=0.02)
+        room.call("finish_case")
+        monkeypatch.setattr(time, "time", lambda: real() - 700)
+        room.until(lambda s: s.at_s < real() - 600)
+        room.call("begin_case", label="berta", operator="", note="")
+        state = room.until(lambda s: s.alarms)
+        assert "clock_set" in {one.code for one in state.alarms}
+        assert state.clock is None
 
 
 def test_between_a_move_and_the_next_measurement_there_is_no_error(room):
@@ -527,7 +565,7 @@ def test_a_target_set_where_oil_appeared_is_not_approached_by_another_protocol(r
 
 
 def test_with_the_polarity_known_the_target_follows_the_protocol(tmp_path):
-    more = "[imaging]\nreadout_polarity = 1\n"
+    more = f"{IMAGING}readout_polarity = 1\n"
     with running_line_room(tmp_path, more) as room:
         room.ready()
         room.call("needle_out")

@@ -47,12 +47,13 @@ RECORDED = {
     ),
 }
 OTHERS = {
-    CALIBRATION: CALIBRATED | {"shifts_px", "method", "last", "same_mount"},
+    CALIBRATION: CALIBRATED | {"shifts_px", "method", "last", "same_mount", "localization"},
     APPROACH: APPROACHED
-    | {"confirm_moves", "most_frames", "proven", "strategy", "stop_rule", "seed"},
-    GUIDE_CALIBRATION: CALIBRATED | {"geometry"},
+    | {"confirm_moves", "most_frames", "proven", "strategy", "stop_rule", "seed"}
+    | {"systematic_mm"},
+    GUIDE_CALIBRATION: CALIBRATED | {"geometry", "localization"},
     GUIDE_APPROACH: APPROACHED
-    | {"confirm_moves", "most_frames", "proven", "geometry", "lower_plane_mm"},
+    | {"confirm_moves", "most_frames", "proven", "geometry", "lower_plane_mm", "systematic_mm"},
 }
 
 

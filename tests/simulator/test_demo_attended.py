@@ -38,7 +38,7 @@ def test_a_case_begins_on_the_page_and_faults_are_switched_while_it_runs(tmp_pat
             demo.stdin.write("no such fault\nduplicate\n")
             demo.stdin.flush()
             wait_until(lambda: "duplicate is on" in said.read_text())
-            assert "there is no fault 'no such fault'" in said.read_text()
+            assert "unknown fault 'no such fault'" in said.read_text()
             client.reset(client.state().robot.taken_um)
             client.start_calibration()
             wait_until(lambda: client.state().calibrated, 300.0)

@@ -115,7 +115,7 @@ def test_a_signal_ends_the_process_cleanly(config: Path, number: signal.Signals)
         (("seed = 5", "sede = 5"), "virtual.sede"),
         (("rotation_deg = 2.0", 'rotation_deg = "2"'), "virtual.placement.rotation_deg"),
         (("acquisition_s = 0.05", "acquisition_s = nan"), "virtual.scanner.acquisition_s"),
-        (("seed = 5", 'faults = ["gremlins"]'), "no fault is called 'gremlins'"),
+        (("seed = 5", 'faults = ["gremlins"]'), "unknown fault 'gremlins'"),
         (("service_url", "servce_url"), "virtual.scanner.service_url"),
         (("seed = 5", "seed = "), "not valid TOML"),
         (("[virtual.scanner]", "[virtual.motors]"), "virtual.scanner: missing table"),

@@ -12,7 +12,8 @@ from service.cli.replay import replay_measurements
 from service.procedure.steps import Acquire, HoldShift, Measure
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
-from sr_engine.worker import PointSpreads, measure
+from sr_engine.request import PointSpreads
+from sr_engine.worker import Known, measure
 from studies.offline_room import MrImaging
 from studies.recorded_room import RecordedRoom
 
@@ -35,7 +36,7 @@ def measured(room, psfs=None):
     if psfs is not None:
         again = room.record.measurement(number)
         number = room.record.request_measurement("ml", again.hold_ids, again.request)
-        measure(room.record, room.record.measurement(number), 2, psfs)
+        measure(room.record, room.record.measurement(number), 2, Known(psfs))
     return room.record.measurement(number)
 
 

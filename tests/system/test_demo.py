@@ -78,7 +78,7 @@ def test_a_killed_process_ends_in_a_stopped_robot_and_the_case_goes_on(demo, vic
     ended = running.ended()
     assert ended.code == 3
     assert f"{victim} was killed by SIGKILL" in ended.err
-    assert "still moved" not in ended.err
+    assert "still moving" not in ended.err
     assert "Traceback" not in ended.err
     running.assert_nothing_left()
 

@@ -88,7 +88,7 @@ def kill_at_random(demo, case_dir, dice, plan) -> str | None:
     ended = running.ended(300.0)
     note(case_dir, f"killed {victim}: exit {ended.code}: {ended.err[-300:]!r}")
     assert "Traceback" not in ended.err
-    assert "still moved" not in ended.err
+    assert "still moving" not in ended.err
     running.assert_nothing_left(60.0)
     return None if ended.code == 0 else victim
 

@@ -88,9 +88,8 @@ def begin(cases: Cases, room: str, by: str, words: Mapping[str, str]) -> Path:
         record.start_case(room, seed=0)
         record.append_event(DESCRIBED, dict(words), source=_SOURCE, who=by)
         if compared is not None:
-            record.append_event(
-                CLOCK_COMPARED, dict(compared.body), source=_SOURCE, who=compared.who
-            )
+            body = {"monotonic_s": compared.monotonic_s, **compared.body}
+            record.append_event(CLOCK_COMPARED, body, source=_SOURCE, who=compared.who)
     cases.set_open(folder)
     return folder
 

@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
 from case_record.cases import Cases
 from room_config.service import GuideConfig
+from service.procedure.approach import SteeredFiducial
+from service.procedure.estimate import FiducialEstimate
 from service.procedure.fiducial_plan import approach_of, calibration_of
+from service.procedure.guide_approach import SteeredGuide
 from service.procedure.guide_plan import guide_approach_of, guide_calibration_of
 from service.procedure.plan import PLAN_VOID, PlanRefusedError
 from service.procedure.registry import (
@@ -23,6 +26,7 @@ from service.procedure.registry import (
 )
 from service.procedure.scan_frame import newest_frame
 from service.procedure.sensing import CONFIRM
+from service.procedure.steering import SteeringArguments, why_never_sure
 from service.procedure.targets import (
     Target,
     TargetError,
@@ -55,7 +59,7 @@ class ProcedureCommands:
             arguments = calibration_of(self._room.config, self._room.travel(), self._room.seed())
         except PlanRefusedError as error:
             raise ConflictError("out_of_travel", f"Calibration: {error}.") from error
-        last, same_mount = last_jacobian(self._room.record, self._cases)
+        last, same_mount = last_jacobian(self._room.record, self._cases, CALIBRATION)
         arguments = replace(arguments, last=last, same_mount=same_mount)
         return self._room.begin(CALIBRATION, calibration_arguments(arguments), by)
 
@@ -64,6 +68,8 @@ class ProcedureCommands:
             arguments = guide_calibration_of(self._room.config, guide, self._room.travel())
         except PlanRefusedError as error:
             raise ConflictError("out_of_travel", f"Calibration: {error}.") from error
+        last, same_mount = last_jacobian(self._room.record, self._cases, GUIDE_CALIBRATION)
+        arguments = replace(arguments, last=last, same_mount=same_mount)
         return self._room.begin(GUIDE_CALIBRATION, guide_calibration_arguments(arguments), by)
 
     def start_approach(self, by: str, guide: bool | None = None) -> int:
@@ -89,6 +95,7 @@ class ProcedureCommands:
             )
         except TargetError as error:
             raise _unusable(error) from error
+        _refuse_hopeless(arguments, SteeredFiducial(arguments).is_sure)
         body = {**approach_arguments(arguments, start), "target": target.number}
         body["scan_frame"] = self._scan_frame()
         return self._room.begin(APPROACH, body, by)
@@ -114,6 +121,7 @@ class ProcedureCommands:
             )
         except TargetError as error:
             raise _unusable(error) from error
+        _refuse_hopeless(arguments, SteeredGuide(arguments).is_sure)
         entry = current_entry_number(self._room.record)
         body = {**guide_approach_arguments(arguments, start), "target": target.number}
         body["entry"], body["scan_frame"] = entry, self._scan_frame()
@@ -214,6 +222,13 @@ class ProcedureCommands:
             "by_hand": arrival_by_hand(self._room.record, found.procedure_id),
         }
         self._room.note(PUNCTURE, by, body)
+
+
+def _refuse_hopeless(
+    arguments: SteeringArguments, is_sure: Callable[[FiducialEstimate], bool]
+) -> None:
+    if why := why_never_sure(arguments, is_sure):
+        raise ConflictError("tolerance_too_tight", f"Not started: {why}.")
 
 
 def _unusable(error: TargetError) -> ConflictError:

@@ -63,6 +63,25 @@ class TargetCommands:
         except ReachUnknownError:
             pass  # an approach asks again before anything moves
 
+    def reach(
+        self, patient_mm: Sequence[float], by: str, in_water: bool = False
+    ) -> tuple[str, str]:
+        """Whether a point could be the target: `within`, `out` or `unknown`, and why.
+
+        Nothing is changed or recorded.
+        """
+        x, y, z = (float(value) for value in patient_mm)
+        plan = Plan(by, "target", "page", (x, y, z))
+        if why := why_senseless(plan) or why_not_in_bore(plan):
+            return "out", why
+        try:
+            check_reach(self._room, plan, in_water=in_water)
+        except OutOfReachError as error:
+            return "out", str(error)
+        except ReachUnknownError as error:
+            return "unknown", str(error)
+        return "within", ""
+
     def withdraw_target(self, by: str) -> None:
         """There is no target any more until another one is set."""
         if current_target(self._room.record) is None:
@@ -78,6 +97,8 @@ class TargetCommands:
             raise ConflictError("no_target", f"Not set: {error}.") from error
         self._void_plan_for(by, "target was changed")
         body: dict[str, Any] = {"patient_mm": list(known.patient_mm), "label": known.label}
+        if known.found_by is not None:
+            body["found_by"] = known.found_by.to_json()
         if known.frame is not None:  # it is where it was set, not where it is chosen again
             body |= {"scan_frame": known.frame.to_json(), "scan_frame_seq": known.frame_seq}
         self._room.note(TARGET_SET, by, {**body, "in_water": known.in_water, "again": number})
