@@ -67,7 +67,7 @@ def _of_csv(path: Path, strategies: Sequence[str], punctures: int) -> dict[str, 
             if not np.isfinite([x, y]).all():
                 raise ValueError(f"{where}: x_mm and y_mm must be finite")
             if np.isfinite(places[row["strategy"]][number - 1]).any():
-                raise ValueError(f"{where}: puncture {number} of {row['strategy']} is there twice")
+                raise ValueError(f"{where}: puncture {number} of {row['strategy']} appears twice")
             places[row["strategy"]][number - 1] = x, y
     for name, found in places.items():
         missing = np.flatnonzero(np.isnan(found[:, 0])) + 1
@@ -93,7 +93,7 @@ def holes_of(
         with Image.open(photo) as image:
             grey = np.asarray(image.convert("L"), dtype=np.float64)
     except OSError as error:
-        raise ValueError(f"{photo}: not a picture that can be read ({error})") from error
+        raise ValueError(f"{photo}: not a readable picture ({error})") from error
     seen = _dark_spots(grey, (hole_mm[0] * px_per_mm, hole_mm[1] * px_per_mm))
     holes: list[Located] = []
     with contextlib.suppress(EngineError):  # nothing to be told from: the count says so

@@ -115,5 +115,5 @@ def _ask(console: Console, text: str) -> None:
     try:
         input()
     except EOFError:
-        raise StudyEndedError("nobody answers; run this again at a terminal to go on") from None
+        raise StudyEndedError("no answer; run this again at a terminal to continue") from None
     console.print()

@@ -147,14 +147,16 @@ class RoomTrials:
             for strategy in strategies:
                 self._trial(strategy)
         except RefusedByServiceError as error:
-            raise StudyEndedError(f"the room refused: {error}; run this again to go on") from error
+            raise StudyEndedError(
+                f"the room refused: {error}; run this again to continue"
+            ) from error
         self._set("", self._study.goal)
 
     def _trial(self, strategy: str) -> None:
         if not self._log.of(strategy):
             self._ask(
-                f"{strategy}: fix a new sheet under the robot and see that it may move; "
-                "it is driven from now on."
+                f"{strategy}: fix a new sheet under the robot and make sure that it may move; it "
+                "is driven from now on."
             )
             self._start(strategy)
         while (number := len(self._log.of(strategy))) < self._study.punctures:
@@ -171,7 +173,7 @@ class RoomTrials:
             except ProcedureEndedError as error:
                 why = str(error)
                 self._tell(f"{strategy}: {why}")
-        raise StudyEndedError(f"{strategy}: came to nothing {_MOST_FAILURES} times: {why}")
+        raise StudyEndedError(f"{strategy}: failed {_MOST_FAILURES} times: {why}")
 
     def _make_target(self, strategy: str) -> None:
         if self._calibrated != strategy:
@@ -257,7 +259,9 @@ class RoomTrials:
 
     def _unlock(self, state: RoomState) -> None:
         if state.robot.insertion_locked:
-            self._ask("Motion is locked: see that the needle is out; motion is unlocked then.")
+            self._ask(
+                "Motion is locked: check that the needle is withdrawn; motion is then unlocked."
+            )
             self._client.needle_out()
 
     def _go_away(self, number: int) -> None:
@@ -346,7 +350,7 @@ class RoomTrials:
             except (ServiceGoneError, RefusedByServiceError) as error:
                 busy = getattr(error, "status", _BUSY) == _BUSY
                 if not busy or time.monotonic() > deadline_s:
-                    raise StudyEndedError(f"{error}; run this again to go on") from error
+                    raise StudyEndedError(f"{error}; run this again to continue") from error
             time.sleep(_POLL_S)
 
 

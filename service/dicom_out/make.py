@@ -63,7 +63,7 @@ def output_of(name: str) -> Output:
         )
     subject, number, kind = found.groups()
     if (subject == "plan") != (kind == "plan"):
-        raise OutputError(f"{name!r} is no output: a plan is plan-NUMBER-plan")
+        raise OutputError(f"{name!r} is not an output; a plan is plan-NUMBER-plan")
     return Output(subject, int(number), kind)  # type: ignore[arg-type]
 
 

@@ -30,7 +30,7 @@ def plan_of(record: CaseRecord, event_id: int) -> Dataset:
     event = next((e for e in plan_events(record) if e.event_id == event_id), None)
     case = record.case()
     if event is None or case is None:
-        raise OutputError(f"event {event_id} is no change of the plan")
+        raise OutputError(f"event {event_id} is not a change of the plan")
     source = pydicom.dcmread(
         record.case_dir / _slice_of(record, event).path, stop_before_pixels=True
     )

@@ -235,7 +235,7 @@ def test_the_holes_of_a_sheet_are_found_in_its_photo_and_one_too_many_is_said(tm
     ("rows", "words"),
     [
         ("base,1,0,0\nbase,2,0,nan\n", "line 3: x_mm and y_mm must be finite"),
-        ("base,1,0,0\nbase,1,0,0\n", "line 3: puncture 1 of base is there twice"),
+        ("base,1,0,0\nbase,1,0,0\n", "line 3: puncture 1 of base appears twice"),
         ("base,1,0,0\nbase,3,0,0\n", "line 3: no puncture 3 of base was made"),
         ("base,1,0,0\nbase,2,,\n", "line 3: puncture, x_mm and y_mm must be numbers"),
         ("base,1,0,0\n", "base has no place of puncture 2"),
