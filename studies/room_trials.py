@@ -32,7 +32,7 @@ from studies.navigation_study import NavigationStudy
 LOG = "punctures.jsonl"
 _POLL_S = 0.1
 _GONE_S = 120.0
-_BUSY = 503
+_BUSY, _NOT_NOW = 503, 409
 _MOST_FAILURES = 4
 _LOOKED_BACK = 900  # events: an approach and what may follow it have fewer
 
@@ -288,8 +288,7 @@ class RoomTrials:
 
     def _procedure(self, start: Callable[[], int]) -> None:
         """Start it, wait for its end; ProcedureEndedError unless it is done."""
-        before = self._idle().event_id
-        number = start()
+        before, number = self._begin(start)
 
         def end() -> EventBody | None:
             events = self._events(before)
@@ -302,20 +301,20 @@ class RoomTrials:
         if event.kind != "procedure_done":
             raise ProcedureEndedError(str(event.body.get("reason", event.kind)))
 
+    def _begin(self, start: Callable[[], int]) -> tuple[int, int]:
+        """The last event before, and the procedure's number; again where the robot was stopped in
+        that instant."""
+        while True:
+            before = self._idle().event_id
+            try:
+                return before, start()
+            except RefusedByServiceError as error:
+                if error.status != _NOT_NOW or _could_move(self._look()):
+                    raise
+
     def _idle(self) -> RoomState:
         """Once nothing runs and the robot could move."""
-        return self._wait(
-            lambda s: (
-                s.belief is not None
-                and s.procedure is None
-                and s.robot.linked
-                and s.robot.armed
-                and not s.robot.stopped
-                and not s.robot.moving
-                and s.robot.position_certain
-            ),
-            "the robot is armed and stands still",
-        )
+        return self._wait(_could_move, "the robot is armed and stands still")
 
     def _settled(self) -> RoomState:
         return self._wait(lambda s: s.procedure is None and s.robot.linked, "the room is done")
@@ -353,6 +352,19 @@ class RoomTrials:
                 if not busy or time.monotonic() > deadline_s:
                     raise StudyEndedError(f"{error}; run this again to continue") from error
             time.sleep(_POLL_S)
+
+
+def _could_move(state: RoomState) -> bool:
+    robot = state.robot
+    return (
+        state.belief is not None
+        and state.procedure is None
+        and robot.linked
+        and robot.armed
+        and not robot.stopped
+        and not robot.moving
+        and robot.position_certain
+    )
 
 
 def _belief(state: RoomState) -> BeliefState:

@@ -160,7 +160,7 @@ export class Images {
       const left = pixels.values.filter((value) => value !== 0);
       const deviation = Math.sqrt(left.reduce((sum, value) => sum + value * value, 0) / Math.max(1, left.length));
       const first = !this.residual.geometry;
-      this.residual.show(slice, pixels, words.residualOf(measurement.slice_id, measurement.chi2_per_dof?.toFixed(2)));
+      this.residual.show(slice, pixels, words.residualOf(measurement.slice_id, measurement.chi2_per_dof?.toFixed(2), measurement.method));
       this.residual.paint({ window: 8 * deviation, level: 0 });
       if (first) this.zoomToFiducial();
     } catch (error) {

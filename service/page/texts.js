@@ -77,7 +77,7 @@ export const TEXTS = {
 
   image: {
     layouts: { slice: "Slice", both: "Both", reconstruction: "Reconstruction", blend: "Blended", residual: "Residual" },
-    residual: "Residual", residualOf: (id, chi2) => `Slice ${id} − model${chi2 ? `, χ² ${chi2} per degree of freedom` : ""}`, noResidual: "No fitted model yet.",
+    residual: "Residual", residualOf: (id, chi2, method) => `Slice ${id} − disc${chi2 ? `, χ² ${chi2} per degree of freedom (${method})` : ""}`, noResidual: "No fitted model yet.",
     which: "Image shown", window: "Window", level: "Level", auto: "Auto", blend: "Blend", smooth: "Smooth", profile: "Profile",
     zoom: "Zoom", zoomIn: "Zoom in", zoomOut: "Zoom out", whole: "Whole", fiducial: "Fiducial",
     noSlice: "No slice yet.", noReconstruction: "No reconstruction yet: it needs slices at several commanded shifts.",

@@ -22,6 +22,7 @@ from sr_engine.residual import residual_image
 
 _MOST_SIDE_PX = 4096
 _WINDOW_PERCENT = (1.0, 99.8)
+_FITTED = ("ml", "template")
 
 
 class ImageMissingError(Exception):
@@ -79,13 +80,14 @@ def load_reconstruction(case_dir: Path, result: Mapping[str, Any]) -> NDArray[np
 
 
 def residual_pixels(record: CaseRecord, measurement_id: int) -> NDArray[np.float64]:
-    """Return the newest slice of a measurement less the round object that was fitted to it.
+    """Return the newest slice of a measurement less a disc where the fiducial was found.
 
-    (rows, cols) of that slice, 0 far from the object; raises ImageMissingError.
+    (rows, cols) of that slice, 0 far from it; raises ImageMissingError where it was found by one of
+    the paper's methods, which fit no disc.
     """
     result = record.measurement(measurement_id).result or {}
     psf = recorded_point_spread(result)
-    if result.get("method") != "ml" or psf is None:
+    if result.get("method") not in _FITTED or psf is None:
         raise ImageMissingError(f"measurement {measurement_id} has no fitted model")
     row, col = result["centre_px"]
     frame = slice_pixels(record, result["slice_id"])

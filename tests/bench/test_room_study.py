@@ -41,20 +41,18 @@ def bench(tmp_path: Path) -> Iterator[BenchDemoRoom]:
         room.end()
 
 
-def arm(client: RoomClient) -> None:
-    wait_until(lambda: client.state().robot.linked)
-    client.reset(client.state().robot.taken_um)
-
-
 @contextmanager
-def rescanning(client: RoomClient) -> Iterator[None]:
-    """Somebody at the page says yes where a slice could not be used."""
+def attended(client: RoomClient) -> Iterator[None]:
+    """Somebody at the page: arms, and says yes where a slice has to be acquired again."""
     done = threading.Event()
 
     def answer() -> None:
         while not done.wait(0.5):
             with suppress(RefusedByServiceError, ServiceGoneError):
-                question = client.state().question
+                state = client.state()
+                question, robot = state.question, state.robot
+                if robot.linked and not robot.moving and (robot.stopped or not robot.armed):
+                    client.reset(robot.taken_um)
                 if question is not None and "rescan" in question.choices:
                     client.answer(question.question_id, "rescan")
 
@@ -139,9 +137,8 @@ class Person:
 def test_a_study_in_the_room_survives_a_sudden_end_and_gives_the_papers_table(bench, tmp_path):
     out = tmp_path / "study"
     person = Person(bench, out, "base,adaptive", 3)
-    with RoomClient(bench.url, by="tester") as client, rescanning(client):
+    with RoomClient(bench.url, by="tester") as client, attended(client):
         with person.begun() as first:
-            arm(client)
             while not person.holes:
                 question = person.next_question(first)
                 assert question is not None
@@ -180,9 +177,8 @@ def test_a_study_in_the_room_survives_a_sudden_end_and_gives_the_papers_table(be
 def test_the_whole_table_ii_in_the_virtual_bench(bench, tmp_path):
     out = tmp_path / "study"
     person = Person(bench, out, ",".join(STRATEGY_NAMES), 14)
-    with RoomClient(bench.url, by="tester") as client, rescanning(client):
+    with RoomClient(bench.url, by="tester") as client, attended(client):
         with person.begun() as first:
-            arm(client)
             for _ in range(20):
                 question = person.next_question(first)
                 assert question is not None

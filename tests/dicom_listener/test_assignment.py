@@ -95,7 +95,7 @@ def test_where_the_clock_may_have_been_set_unseen_a_slice_waits_for_another_comp
     waiting = decide(offset=replace(SAME_CLOCK, low_if_set_s=-20.0))
     assert isinstance(waiting, Pending)
     assert why(waiting) == Reason.CLOCK_UNKNOWN
-    assert "not compared since hold 1 settled" in waiting.text
+    assert "not been compared since hold 1 settled" in waiting.text
     assert isinstance(decide(offset=replace(SAME_CLOCK, low_if_set_s=-9.9)), Assigned)
     before = replace(STANDING, settled_at_s=1000.5)
     assert why(decide(holds=[before], offset=replace(SAME_CLOCK, low_if_set_s=0.6))) == (
