@@ -21,12 +21,14 @@ from typing import Any
 import numpy as np
 from _approaches import Cycle, FastRoom, say
 
+from case_record.cases import Cases
 from case_record.record import CaseRecord
 from case_record.rows import NewSlice
 from room_config.load import Config, load_config
 from service.cli.export import write_export
 from service.cli.report import report_page
 from service.client import RoomClient
+from service.room.cases.life import CaseLife
 from service.room.describe import Describer
 from service.room.execution import Execution
 from service.room.link import PumpedClient, RoomLink
@@ -128,7 +130,8 @@ def _config(case_dir: Path) -> Config:
 def _describing(config: Config, record: CaseRecord) -> Callable[[], object]:
     link = RoomLink(PumpedClient("/dev/null", name="benchmark"), lambda text: None)
     execution = Execution(config, record, link, lambda: None)
-    describer = Describer(config, record, link)
+    life = CaseLife(Cases(*config.room.folders), record, time.time())
+    describer = Describer(config, record, link, life)
     state = describer.describe(execution, RoomState.initial(config))
     return lambda: describer.describe(execution, state)
 

@@ -199,8 +199,9 @@ def _if_set(slice_: Slice, hold: HoldWindow, offset: Offset, rules: AssignRules)
         return None
     return Pending(
         Reason.CLOCK_UNKNOWN,
-        f"the clocks were not compared since hold {hold.hold_id} settled, and the scanner's may "
-        "have been set: compare the clocks, or confirm at which hold this acquisition was made",
+        f"the clocks have not been compared since hold {hold.hold_id} settled, and the scanner's "
+        "clock may have been set: compare the clocks, or confirm the hold at which this "
+        "acquisition was made",
     )
 
 

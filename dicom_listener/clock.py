@@ -171,15 +171,15 @@ class ScannerClock:
         compared = self.by_comparison(slice_, rules)
         if compared is not None and _ahead_s(slice_, compared, rules) > rules.jump_tolerance_s:
             return OffsetUnknown(f"it arrived sooner than the comparison allows: {_WHAT_TO_DO}")
-        # of a slice that comes later than any did when this was measured, promptness says nothing
-        unlike = _unlike_measured(self, slice_, rules)
-        prompt = None if unlike else self._by_promptness(slice_, rules)
+        prompt = self._by_promptness(slice_, rules)
         lows = [bounds.low_s for bounds in (compared, prompt) if bounds is not None]
-        if not lows and unlike and self.is_witnessed(rules):
+        # of a slice that comes later than any did when this was measured, promptness proves nothing
+        unlike = _unlike_measured(self, slice_, rules)
+        if compared is None and unlike and self.is_witnessed(rules):
             return OffsetUnknown(f"{unlike}: {_SCAN_AGAIN}")
         if not lows:
             return OffsetUnknown(f"{self._why_unknown(slice_, rules)}: {_WHAT_TO_DO}")
-        if_set = self._low_if_set_s(slice_, rules) if prompt is None else None
+        if_set = self._low_if_set_s(slice_, rules) if prompt is None or unlike else None
         return OffsetBounds(min(lows), max(self._high_s(slice_, rules), min(lows)), if_set)
 
     def _low_if_set_s(self, slice_: Received, rules: ClockRules) -> float | None:

@@ -408,7 +408,7 @@ class Intake:
         oldest_s = time.time() - self._rules.clock.comparison_valid_s
         is_flood = len(self._pending) > _WAITING_AT_MOST
         if is_flood and not self._is_flooded:
-            text = f"more than {_WAITING_AT_MOST} slices wait: the oldest are set aside"
+            text = f"more than {_WAITING_AT_MOST} slices are pending: the oldest are set aside"
             self.alarm("many_slices_wait", text)
         self._is_flooded = is_flood or (self._is_flooded and bool(self._pending))
         for slice_id in list(self._pending):
@@ -417,9 +417,9 @@ class Intake:
                 self._follow(row)
                 continue
             if len(self._pending) > _WAITING_AT_MOST:
-                why = f"more than {_WAITING_AT_MOST} slices wait"
+                why = f"more than {_WAITING_AT_MOST} slices were pending"
             elif slice_id in self._clockless and row.received_s < oldest_s:
-                why = "it waited too long for the clocks to be compared"
+                why = "it was pending too long: the clocks were not compared"
             else:
                 return
             text = f"{why} ({row.reason})"

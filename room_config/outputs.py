@@ -7,7 +7,7 @@ from pydantic import Field, model_validator
 
 from room_config.section import Section
 
-OutputKind = Literal["image", "report", "presentation"]
+OutputKind = Literal["image", "report", "presentation", "plan"]
 
 
 class Destination(Section):
@@ -34,7 +34,8 @@ class Destination(Section):
         description="What it receives: `image` (derived MR image of every reconstruction), "
         "`report` "
         "(measurement report of every READY and every puncture), `presentation` (presentation "
-        "state of every READY).",
+        "state of every READY); and, where it is asked for, `plan` (target and entry point as "
+        "Spatial Fiducials, whenever they change).",
     )
     tls_certificate: Path | None = Field(
         default=None, description="PEM file; with tls_key and tls_authority: mutual TLS."

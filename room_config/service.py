@@ -146,6 +146,11 @@ class ServiceConfig(Section):
         description="The address of the page behind a reverse proxy, such as "
         "https://navigator.example.org/room1/; empty: host and port are opened directly.",
     )
+    camera_preview_url: str = Field(
+        default="",
+        pattern=r"^(https?://\S+)?$",
+        description="At a bench: the live view of `autospine camera`; the page links to it.",
+    )
     trusted_proxies: list[str] = Field(
         default=["127.0.0.1", "::1"],
         description="Addresses and networks of the proxies whose X-Forwarded-For is trusted.",

@@ -26,6 +26,7 @@ from service.web.schemas import (
     CaseBegun,
     EventBody,
     Health,
+    ReachBody,
     SessionBody,
     SliceBody,
     Started,
@@ -214,6 +215,12 @@ class RoomClient:
         """Where the fiducial is to be, LPS mm; in_water: a place in tissue."""
         fields = {"patient_mm": list(patient_mm), "label": label, "in_water": in_water}
         self._order("PUT", "/api/v1/target", **fields)
+
+    def reach(self, patient_mm: Sequence[float], *, in_water: bool = False) -> ReachBody:
+        """Whether a point could be the target; nothing is changed."""
+        fields = {"patient_mm": list(patient_mm), "in_water": in_water}
+        answer = self._order("POST", "/api/v1/target/reach", **fields)
+        return ReachBody.model_validate_json(answer.text)
 
     def withdraw_target(self) -> None:
         """There is no target any more until another one is set."""

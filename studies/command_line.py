@@ -73,7 +73,10 @@ def numerical(
 
 @app.command()
 def benchtop(
-    trials: Annotated[int, typer.Option(help="Punctures per strategy, in rooms of 14.")] = 140,
+    trials: Annotated[
+        int | None,
+        typer.Option(help="Punctures per strategy: 140, in rooms of 14; with --room 14."),
+    ] = None,
     seed: Annotated[
         int, typer.Option(help="Seed of every random draw; the same seed gives the same numbers.")
     ] = 1,
@@ -86,10 +89,39 @@ def benchtop(
     step_scatter: Annotated[
         float, typer.Option(help="Relative scatter of the motors' step length.")
     ] = 0.002,
+    room: Annotated[
+        Path | None, typer.Option(help="Drive this real room instead (its room.toml); needs --out.")
+    ] = None,
+    strategies: Annotated[
+        str, typer.Option(help="With --room: those to compare, in this order.")
+    ] = "base,bicubic,sr,hybrid,adaptive",
+    measured: Annotated[
+        Path | None,
+        typer.Option(help="With --room: places as CSV, or a folder of photos STRATEGY.png."),
+    ] = None,
+    px_per_mm: Annotated[float | None, typer.Option(help="Scale of the photos.")] = None,
+    hole_mm: Annotated[
+        tuple[float, float], typer.Option(help="Least and largest radius of a hole in the photos.")
+    ] = (0.1, 0.8),
 ) -> None:
-    """The paper's Table III, benchtop columns: every strategy steers by the camera."""
+    """The paper's Table III, benchtop columns: every strategy steers by the camera.
+
+    With --room it drives the real room through the paper's Table II; the same command again goes on
+    where it ended.
+    """
     with _one_line_errors():
-        _run_navigation("benchtop", trials, seed, out, as_json, scheduler, snr, step_scatter)
+        if room is None:
+            _run_navigation(
+                "benchtop", trials or 140, seed, out, as_json, scheduler, snr, step_scatter
+            )
+            return
+        if out is None:
+            raise ValueError("--room needs --out: the folder in which the study is kept")
+        # Loaded here, so that the command's help costs nothing.
+        from studies.room_study import Asked, run_in_room
+
+        asked = Asked(strategies, trials or 14, seed, measured, px_per_mm, hole_mm)
+        run_in_room(room, out, asked, as_json=as_json)
 
 
 @app.command()

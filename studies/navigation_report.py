@@ -83,6 +83,33 @@ def print_tables(study: NavigationStudy, console: Console) -> None:
             str(row.punctures) + (f", {row.failures} failed" if row.failures else ""),
         )
     console.print(ours)
+    _print_paper(study, console)
+    console.print("Not given in the paper, assumed here:")
+    for name, text in ASSUMPTIONS.items():
+        console.print(f"  {name}: {text}", highlight=False)
+
+
+def print_measured(study: NavigationStudy, console: Console) -> None:
+    """Of a real room: what was measured on the sheets beside the paper's."""
+    ours = _table(f"{study.setup}, this room: mean (SD)")
+    for heading in ("σ said mm", "frames", "n"):
+        ours.add_column(heading, justify="right")
+    for row in study.summaries():
+        said = float(np.median([one.sigma_mm for one in study.punctures(row.strategy)]))
+        ours.add_row(
+            row.strategy,
+            f"{row.mean_iterations:.2f} ({row.sd_iterations:.2f})",
+            f"{row.mean_minutes:.2f} ({row.sd_minutes:.2f})",
+            f"{row.puncture_sd_mm:.3f}",
+            f"{said:.3f}",
+            f"{row.median_frames:g}",
+            str(row.punctures + 1),
+        )
+    console.print(ours)
+    _print_paper(study, console)
+
+
+def _print_paper(study: NavigationStudy, console: Console) -> None:
     paper = _table(f"{study.setup}, the paper's Table III: mean (SD)")
     for name, row_of_paper in PAPER_TABLE[study.setup].items():
         iterations, sd_iterations, minutes, sd_minutes, precision = row_of_paper
@@ -94,9 +121,6 @@ def print_tables(study: NavigationStudy, console: Console) -> None:
         )
     console.print(paper)
     _print_tests(study, console)
-    console.print("Not given in the paper, assumed here:")
-    for name, text in ASSUMPTIONS.items():
-        console.print(f"  {name}: {text}", highlight=False)
 
 
 def _table(title: str) -> Table:

@@ -8,6 +8,7 @@ need storescu dcmtk
 need Orthanc orthanc
 need chromium chromium
 need nginx nginx-light
+need caddy caddy
 need docker-compose docker-compose
 need dciodvfy dicom3tools
 [ -n "$wanted" ] || exit 0

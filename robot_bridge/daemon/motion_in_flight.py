@@ -208,9 +208,10 @@ class MotionInFlight:
         if not motion.started:
             return
         going = self.whereabouts.going(motion.record.setpoints_um)
-        self.whereabouts.arrived(readback_um, self.certain_axes)
+        within_um = {a: status.within_um[a] for a in going.keys() & status.within_um.keys()}
+        self.whereabouts.arrived(readback_um, self.certain_axes, within_um)
         lost = {axis: stand for axis, stand in going.items() if axis not in self.certain_axes}
-        self.whereabouts.ended_early(lost, readback_um, status.within_um)
+        self.whereabouts.ended_early(lost, readback_um, within_um)
 
     def _finish(self, ending: Ending) -> None:
         assert self._motion is not None

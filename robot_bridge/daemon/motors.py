@@ -32,8 +32,8 @@ class MotorStatus:
     readback_um: by axis; for an open-loop axis the position that the step count implies.
     certain_axes: an axis is not among them from power-up, controller reset, stall or an unexpected
         motion until its own `home` or `declare_position`; its readback says nothing then.
-    within_um: of an axis whose run was cut short and that is not certain since: how far from its
-        readback that run may have ended.
+    within_um: of an axis whose last motion was cut short: how far from its readback it may have
+        ended.
     fault: a short code while something is wrong (a fault ends the motion), else None.
     boards: the serial number of each axis's controller, "" if it tells none.
     setting_up: controllers are being initialised (again); poll as often as during a motion.

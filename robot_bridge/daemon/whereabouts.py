@@ -122,12 +122,15 @@ class Whereabouts:
             if self.moves(axis, setpoints_um)
         }
 
-    def arrived(self, readback_um: Mapping[str, int], axes: Collection[str]) -> None:
-        """These axes stand, certain, where they read."""
+    def arrived(
+        self, readback_um: Mapping[str, int], axes: Collection[str], within_um: Mapping[str, int]
+    ) -> None:
+        """These axes stand, certain, where they read, give or take `within_um`, if it is there."""
         for axis in axes:
             if axis in self.stands:
-                stand = self.stands[axis]
-                self.stands[axis] = stand.moved(readback_um[axis], self.growth_of(axis))
+                stand, within = self.stands[axis], within_um.get(axis, 0)
+                growth = self.growth_of(axis)
+                self.stands[axis] = stand.cut_short(readback_um[axis], within, growth)
 
     def ended_early(
         self, going: Mapping[str, Stand], readback_um: Mapping[str, int],

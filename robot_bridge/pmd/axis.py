@@ -21,7 +21,7 @@ from robot_bridge.pmd.controller import (
     Steps,
 )
 from robot_bridge.pmd.line import Pause, Procedure
-from robot_bridge.pmd.progress import ProgressWatch, agrees, disagreement
+from robot_bridge.pmd.progress import CutLeg, ProgressWatch, agrees, disagreement
 from robot_bridge.pmd.protocol import (
     MICROSTEPS_PER_STEP,
     Command,
@@ -56,6 +56,7 @@ class PmdAxis(PmdController):
         self._holds_motion = False  # a motion is stored on the board
         self._begun_s = 0.0  # when what moves it was sent
         self.unread = False  # it was stopped on its way, and nobody has asked yet where it stands
+        self._cut_leg: CutLeg | None = None
         self.within_um: float | None = None  # after a run that was cut short: of its readback
 
     @property
@@ -73,6 +74,8 @@ class PmdAxis(PmdController):
     def read_status(self) -> Steps[Status]:
         asked_s = self.clock()
         status = yield from super().read_status()
+        if self._cut_leg is not None and not status & (Status.RUNNING | Status.TARGET_MODE):
+            self._cut_leg.stood_s = min(self._cut_leg.stood_s, self.clock())
         run = self._run or self._cut
         if run is not None:
             run.saw(bool(status & Status.RUNNING), asked_s, self.clock())
@@ -99,12 +102,25 @@ class PmdAxis(PmdController):
             self.certain = False
             self.unread = False
             raise
+        self.at_rest_um = self.position_um
+        self._was_read()
+
+    def _was_read(self) -> None:
+        """The encoder may have died before the stop; one not seen to follow for long must have
+        gone on.
+        """
         self.unread = False
+        if self._cut_leg is None:
+            return
+        leg, self._cut_leg = self._cut_leg, None
+        self.within_um = leg.unsure_um(self.position_um)
+        if leg.stale and leg.gone_um(self.position_um) <= self.jitter_um:
+            self.certain = False
 
     def refresh(self) -> Procedure:
         yield from self._forget_stored()  # of a motion that was stopped
         yield from super().refresh()
-        self.unread = False
+        self._was_read()
 
     def stands_at(self, setpoint_um: float) -> bool:
         return self._is_near(self.position_um, setpoint_um)
@@ -116,16 +132,16 @@ class PmdAxis(PmdController):
     def move(self, setpoint_um: int, park_afterwards: bool) -> Procedure:
         self.fault = None
         try:
-            yield from self.read_status()
-            yield from self.check_status()
-            yield from self.read_position()
-            self.check_rest()
+            yield from self.look_at_rest()
+            self._was_read()
             if self.stands_at(setpoint_um):
                 return
+            if not self.certain:
+                raise self.error("position_uncertain", "it was not seen where it was stopped")
+            self.within_um = None  # the bridge has taken it into account
             yield from verify(self)
             yield from self.unpark()
-            yield from self.read_position()
-            self.check_rest()
+            yield from self.look_at_rest()
             yield from self._prove(setpoint_um)
             for leg_um in pmd_units.legs_um(self.config, self.position_um, setpoint_um):
                 if self.closed_loop:
@@ -199,12 +215,18 @@ class PmdAxis(PmdController):
         try:
             yield from self._follow(setpoint_um, watch)
         except GeneratorExit:  # stopped on the way
-            if watch.is_stale(self.clock()):
-                self.certain = False  # its encoder may just have died
+            self._cut_leg = CutLeg(
+                self.position_um,
+                watch.last_look_s,
+                setpoint_um - self.position_um,
+                watch.fastest_um_s,
+                watch.is_stale(self.clock()),
+            )
             raise
         yield from self._leave_target_mode()
         yield from self._forget_stored()
         yield from self.read_position_surely()
+        yield from self.check_no_reset()
         self.unread = False
 
     def _follow(self, setpoint_um: int, watch: ProgressWatch) -> Steps[None]:
@@ -213,6 +235,7 @@ class PmdAxis(PmdController):
         while True:
             yield Pause(POLL_PAUSE_S)
             status = yield from self.read_status()
+            asked_s = self.clock()
             yield from self.read_position()
             yield from self._check_moving()
             error_um = abs(self.position_um - setpoint_um)
@@ -231,7 +254,7 @@ class PmdAxis(PmdController):
             if watch.is_away(error_um):  # a count that was reset in between looks the same
                 yield from self.read_status()
                 yield from self.check_status()
-            if wrong := watch.what_is_wrong(error_um, self.clock()):
+            if wrong := watch.what_is_wrong(error_um, asked_s, self.clock()):
                 self.certain = False
                 raise self.error(*wrong)
 
@@ -377,7 +400,7 @@ class PmdAxis(PmdController):
     def _declared(self) -> None:
         self.at_rest_um = self.position_um
         self.certain = True
-        self._cut = self.within_um = None
+        self._cut = self._cut_leg = self.within_um = None
         self.fault = None
 
     # Stopping

@@ -226,23 +226,32 @@ class PmdController:
 
     def refresh(self) -> Procedure:
         """Status and position while nothing of ours moves."""
-        at_um = yield from self._look()
-        if self.at_rest_um is not None and not self._is_near(at_um, self.at_rest_um):
-            at_um = yield from self._look()  # it may have been the line
-        if self.closed_loop:
-            self.position_um = at_um
-        self.check_rest()
+        yield from self.look_at_rest()
         if self.at_rest_um is None:
             self.at_rest_um = self.position_um
         yield from self._read_supply_if_due()
         self.fault = None
 
+    def look_at_rest(self) -> Steps[None]:
+        """Raises AxisFaultError if it does not rest."""
+        at_um = yield from self._look()
+        was_um = self.position_um if self.at_rest_um is None else self.at_rest_um
+        if not self._is_near(at_um, was_um):
+            at_um = yield from self._look()  # it may have been the line
+        if self.closed_loop:
+            self.position_um = at_um
+        self.check_rest()
+
     def _look(self) -> Steps[float]:
         """The position, and then whether the board had lost its supply before it told that."""
         at_um = yield from self.ask_position()
+        yield from self.check_no_reset()
+        return at_um
+
+    def check_no_reset(self) -> Steps[None]:
+        """After a position was read: a board that has lost its supply counts from zero again."""
         yield from self.read_status()
         yield from self.check_status()
-        return at_um
 
     def _is_near(self, at_um: float, other_um: float) -> bool:
         return abs(at_um - other_um) <= self.config.tolerance_um

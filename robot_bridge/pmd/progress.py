@@ -1,5 +1,8 @@
 """Whether an encoder follows its motor: over a short run, and on the way to a target."""
 
+import math
+from dataclasses import dataclass
+
 from robot_bridge.daemon.config import AxisConfig
 from robot_bridge.pmd import units as pmd_units
 from robot_bridge.pmd.setup import MIN_SPEED_HZ
@@ -27,12 +30,40 @@ def disagreement(moved_um: float, distance_um: float) -> str:
     )
 
 
+@dataclass
+class CutLeg:
+    """A way in closed loop that was stopped; its encoder may have died since the last look.
+
+    at_um, at_s: the last look; way_um: what was left then. stale: no progress was seen for long.
+    """
+
+    at_um: float
+    at_s: float
+    way_um: float
+    speed_um_s: float
+    stale: bool
+    stood_s: float = math.inf  # it was seen to stand then
+
+    def gone_um(self, now_um: float) -> float:
+        return (now_um - self.at_um) * math.copysign(1.0, self.way_um)
+
+    def unsure_um(self, now_um: float) -> float:
+        """What it may have gone that the encoder did not see."""
+        most_um = min(
+            abs(self.way_um) + RUNAWAY_MARGIN_UM, self.speed_um_s * (self.stood_s - self.at_s)
+        )
+        return max(0.0, most_um - self.gone_um(now_um))
+
+
 class ProgressWatch:
     """Tells a motor that does not come nearer (stalled, encoder lost) or runs away."""
 
     def __init__(self, config: AxisConfig, distance_um: float, now_s: float) -> None:
-        self._best_um = distance_um
-        self._best_s = now_s
+        self._best_um = self._last_um = distance_um
+        self._best_s = self.last_look_s = now_s
+        step_um = max(config.step_um_forward, config.step_um_reverse)
+        self._nominal_um_s = config.speed_hz * step_um
+        self._seen_um_s = 0.0
         self._looks = 0
         self._bound_um = distance_um + RUNAWAY_MARGIN_UM
         slowest_um_s = MIN_SPEED_HZ * config.step_um_forward
@@ -45,9 +76,20 @@ class ProgressWatch:
     def is_away(self, error_um: float) -> bool:
         return error_um > self._bound_um
 
-    def what_is_wrong(self, error_um: float, now_s: float) -> tuple[str, str] | None:
-        """A code and a text, or None."""
+    @property
+    def fastest_um_s(self) -> float:
+        """Steps may be longer than set, and it may be ramping up."""
+        return max(self._nominal_um_s, 1.5 * self._seen_um_s) / FOLLOWS
+
+    def what_is_wrong(
+        self, error_um: float, asked_s: float, now_s: float
+    ) -> tuple[str, str] | None:
+        """A code and a text, or None. asked_s: the encoder was asked not before."""
         self._looks += 1
+        if asked_s > self.last_look_s:
+            gone_um = abs(self._last_um - error_um)
+            self._seen_um_s = max(self._seen_um_s, gone_um / (asked_s - self.last_look_s))
+        self._last_um, self.last_look_s = error_um, asked_s
         if error_um < self._best_um:
             self._best_um, self._best_s, self._looks = error_um, now_s, 0
         if self.is_away(error_um):

@@ -14,12 +14,12 @@ import typer
 
 from dicom_listener.promptness import FEWEST_DELAYS, TooFewDelaysError
 from room_config.exit_codes import BAD_INPUT, COULD_NOT, DONE
-from room_config.imaging import ImagingConfig
-from room_config.load import load_config
-from service.commissioning.acceptance import as_toml, items_of, room_keys
+from room_config.load import Config, load_config
+from service.commissioning.acceptance import Item, as_toml, items_of, room_keys
 from service.commissioning.clocks import find_clock
 from service.commissioning.evidence import CommissioningError, Press
 from service.commissioning.imaging import find_imaging
+from service.commissioning.motion import jacobian_items, jacobian_of_case
 from service.commissioning.report import Signature, verdict_of, write_html, write_pdf
 from service.commissioning.session import Session, Step
 
@@ -50,6 +50,10 @@ def commission(
     patience_s: Annotated[
         float, typer.Option(min=1, help="How long to wait for the slices of a series.")
     ] = 300.0,
+    case: Annotated[
+        Path | None,
+        typer.Option(help="Folder of a case calibrated here; its image Jacobian is accepted too."),
+    ] = None,
 ) -> None:
     """Measure the clocks, promptness and imaging of a site; write keys and an acceptance."""
     warnings.filterwarnings("ignore", module="pydicom")
@@ -61,13 +65,14 @@ def commission(
         )
         raise SystemExit(BAD_INPUT)
     room = load_config(config)
+    motion = [] if case is None else jacobian_items(jacobian_of_case(case), case.name)
     with Session(room, out) as session:
         print(f"Slices are received on port {session.port} as {room.listener.ae_title}.")
         print("Put a phantom with the fiducial on the table and leave it still; nothing may move.")
         for step in session.steps(series, reversed_too=reversed_readout):
             while not _scan(session, step, slices, patience_s):
                 print("The same series again.")
-        raise SystemExit(_judge(session, room.room.name, who, out, room.imaging))
+        raise SystemExit(_judge(session, room, who, out, motion))
 
 
 def _scan(session: Session, step: Step, slices: int, patience_s: float) -> bool:
@@ -95,19 +100,23 @@ def _pressed(kind: str, words: str) -> Press:
     return Press("start" if kind == "start" else "end", time.time())
 
 
-def _judge(session: Session, site: str, who: str, out: Path, imaging: ImagingConfig) -> int:
+def _judge(session: Session, room: Config, who: str, out: Path, motion: list[Item]) -> int:
     """Write what was found; 0 where all of it is within its limits."""
-    scanned = session.series()
+    scanned, site = session.series(), room.room.name
     try:
-        clock, images = find_clock(scanned), find_imaging(scanned, imaging)
+        clock, images = find_clock(scanned), find_imaging(scanned, room.imaging)
     except TooFewDelaysError as error:
         raise CommissioningError(f"{error}: scan more series") from None
-    items = items_of(clock, images)
+    items = [*items_of(clock, images), *motion]
     signature = Signature(who, time.time(), session.digest())
     (out / "room_keys.toml").write_text(
         as_toml(room_keys(clock, images), f"By autospine commission. {signature}")
     )
-    findings = {"clock": dataclasses.asdict(clock), "imaging": dataclasses.asdict(images)}
+    findings = {
+        "clock": dataclasses.asdict(clock),
+        "imaging": dataclasses.asdict(images),
+        "items": [dataclasses.asdict(item) for item in items],
+    }
     (out / "findings.json").write_text(json.dumps(findings, indent=1))
     write_html(out / "acceptance.html", site, items, signature)
     write_pdf(out / "acceptance.pdf", site, items, signature)

@@ -103,6 +103,12 @@ def _imaging_items(found: ImagingFinding) -> list[Item]:
             "Pixel size from the header", "{:g} x {:g} mm".format(*found.spacing_mm), "square",
             math.isclose(*found.spacing_mm, rel_tol=1e-3),
         ),
+        Item(
+            "Chi squared per degree of freedom of the fiducial's own template",
+            found.template_problem or f"{found.template_chi2:.2f}",
+            f"at most {_MOST_CHI2:g}",
+            None if found.template_problem else found.template_chi2 <= _MOST_CHI2,
+        ),
         Item("Distortion", corrected[found.distortion_corrected], "", None),
         Item(
             "Oil shift along the readout",

@@ -18,6 +18,7 @@ from sr_engine.localization import Localization
 from sr_engine.localize import localize
 from sr_engine.psf import Psf
 from sr_engine.recognise import psf_of_noise
+from sr_engine.template import learn_template
 
 LEAST_AGREEMENT = 0.6
 _SURE_SIGMA = 5.0
@@ -31,7 +32,8 @@ class ImagingFinding:
     one localization says of itself, scatter_px: what they scatter by, of scatter_dof degrees of
     freedom. distortion_corrected None:
     the header does not say. polarity 0: not known; oil_shift_px: half of what the oil moved by
-    along the readout when its sign was changed, ± oil_sigma_px.
+    along the readout when its sign was changed, ± oil_sigma_px. template_chi2: of the fiducial's
+    own image; nan: it was not learnt, for the template_problem.
     """
 
     psf: Psf | None
@@ -50,6 +52,8 @@ class ImagingFinding:
     oil_shift_px: float
     oil_sigma_px: float
     oil_expected_px: float
+    template_chi2: float
+    template_problem: str
 
 
 def find_imaging(series: Sequence[ScannedSeries], imaging: ImagingConfig) -> ImagingFinding:
@@ -65,6 +69,8 @@ def find_imaging(series: Sequence[ScannedSeries], imaging: ImagingConfig) -> Ima
     spacing_mm = header.geometry.spacing_mm
     radii_mm = np.array([one.radius_px for one in found]) * float(np.mean(spacing_mm))
     polarity, shift_px, shift_sigma_px, expected_px = _oil(usual, changed, found, imaging, psf)
+    moved = (shift_px, shift_sigma_px) if polarity else None
+    template_chi2, template_problem = _template(usual, changed, found, moved)
     return ImagingFinding(
         psf=psf,
         agreement=agreement,
@@ -82,6 +88,8 @@ def find_imaging(series: Sequence[ScannedSeries], imaging: ImagingConfig) -> Ima
         oil_shift_px=shift_px,
         oil_sigma_px=shift_sigma_px,
         oil_expected_px=expected_px,
+        template_chi2=template_chi2,
+        template_problem=template_problem,
     )
 
 
@@ -104,7 +112,7 @@ def _fiducials(
         imaging.fiducial_radius_max_mm / spacing_mm,
     )
     if len({reception.pixels.shape for reception in receptions}) > 1:
-        raise CommissioningError("the slices are not all of one size: scan with one protocol")
+        raise CommissioningError("the slices differ in size: scan with one protocol")
     mean = np.mean([reception.pixels for reception in receptions], axis=0)
     try:
         start_px = _start(mean, imaging, radii)
@@ -151,6 +159,38 @@ def _oil(
     if not abs(shift_px) > _SURE_SIGMA * sigma_px:
         return 0, shift_px, sigma_px, expected_px
     return (1 if shift_px > 0 else -1), shift_px, sigma_px, expected_px
+
+
+def _template(
+    usual: Sequence[Reception],
+    changed: Sequence[Reception],
+    found: Sequence[Localization],
+    moved: tuple[float, float] | None,
+) -> tuple[float, str]:
+    """(chi squared per degree of freedom, why there is none) of the fiducial's own template.
+
+    The oil is what moves when the readout's sign is changed, so that its image can be learnt as in
+    a calibration; from half of the slices, and tried on the others.
+    """
+    along, _ = _expected(usual[0])
+    if moved is None or along is None:
+        return float("nan"), "it takes the slices with the sign of the readout changed"
+    learnt = usual[: len(usual) // 2]
+    shift_px, sigma_px = moved
+    shifts_px = [0 * along] * len(learnt) + [-2 * shift_px * along] * len(changed)
+    radius_px = float(np.median([one.radius_px for one in found]))
+    try:
+        template = learn_template(
+            np.array([reception.pixels for reception in (*learnt, *changed)]),
+            np.array(shifts_px),
+            radius_px=(0.7 * radius_px, 1.4 * radius_px),
+            centre_px=_mean(found),
+            shift_sigma_px=2 * sigma_px,
+        )
+        fits = [template.fit(r.pixels, template.reference_px) for r in usual[len(learnt) :]]
+    except EngineError as error:
+        return float("nan"), str(error)
+    return float(np.median([fit.chi2_per_dof for fit in fits])), ""
 
 
 def _expected(reception: Reception) -> tuple[NDArray[np.float64] | None, float]:

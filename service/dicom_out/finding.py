@@ -16,6 +16,7 @@ from dicom_slice.geometry import SliceGeometry
 from service.procedure.estimate import axis_sigma, probability_within
 from service.procedure.plane import ImagePlane
 from service.procedure.registry import APPROACHES, GUIDE_APPROACH
+from service.procedure.targets import ENTRY_SET, TARGET_SET
 from service.room.history import targets_over_time
 from service.room.present import READY
 from sr_engine.request import geometry_of
@@ -142,6 +143,13 @@ def finding_of_puncture(record: CaseRecord, event_id: int) -> Finding:
         raise CaseRecordError(f"{record.case_dir}: event {event_id} is not a puncture")
     found = finding_of_arrival(record, int(puncture.body["procedure_id"]))
     return Finding(**{**vars(found), "puncture": puncture})
+
+
+def plan_events(record: CaseRecord) -> list[Event]:
+    """By which the plan, target and entry point, changed; none before slices say whose it is."""
+    if record.last_slice("assigned") is None:
+        return []
+    return [event for kind in (TARGET_SET, ENTRY_SET) for event in record.events_of_kind(kind)]
 
 
 def _approach_during(record: CaseRecord, row: Measurement) -> Procedure | None:

@@ -12,7 +12,7 @@ from service.dicom_out.finding import Finding
 
 MAKER = "AutoSPINe Navigator"
 RESEARCH = "Research software, not a medical device. Not for diagnosis."
-SERIES_NUMBERS = {"image": 9001, "report": 9002, "presentation": 9003}
+SERIES_NUMBERS = {"image": 9001, "report": 9002, "presentation": 9003, "plan": 9004}
 _DESCRIPTION_CHARACTERS = 64
 
 

@@ -25,20 +25,22 @@ from service.dicom_out.errors import OutputError
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
-from service.dicom_out.finding import Finding, arrivals_said_ready
+from service.dicom_out.finding import Finding, arrivals_said_ready, plan_events
 
 FOLDER = "outputs"
-Kind = Literal["image", "report", "presentation"]
-Subject = Literal["measurement", "approach", "puncture"]
+Kind = Literal["image", "report", "presentation", "plan"]
+Subject = Literal["measurement", "approach", "puncture", "plan"]
 _AT_ONCE = 200
 _NAME = re.compile(
-    r"(measurement|approach|puncture)-([1-9][0-9]{0,15})-(image|report|presentation)"
+    r"(measurement|approach|puncture|plan)-([1-9][0-9]{0,15})-(image|report|presentation|plan)"
 )
 
 
 @dataclass(frozen=True)
 class Output:
-    """`number` is the id of the measurement, of the approach (its READY), or of the event."""
+    """`number` is the id of the measurement, of the approach (its READY), or of the event: of a
+    puncture, or by which the plan changed (subject and kind `plan`).
+    """
 
     subject: Subject
     number: int
@@ -60,11 +62,13 @@ def output_of(name: str) -> Output:
             f"{name!r} is not an output; expected SUBJECT-NUMBER-KIND, such as approach-5-report"
         )
     subject, number, kind = found.groups()
+    if (subject == "plan") != (kind == "plan"):
+        raise OutputError(f"{name!r} is not an output; a plan is plan-NUMBER-plan")
     return Output(subject, int(number), kind)  # type: ignore[arg-type]
 
 
 def outputs_to_send(record: CaseRecord, after_measurement: int = 0) -> Iterator[Output]:
-    """What is sent unasked: reconstructions, and reports of every READY and puncture."""
+    """What is sent unasked: reconstructions, reports of every READY and puncture."""
     while rows := record.page_of_measurements(
         after_id=after_measurement, limit=_AT_ONCE, newest=False
     ):
@@ -79,6 +83,12 @@ def outputs_to_send(record: CaseRecord, after_measurement: int = 0) -> Iterator[
         yield Output("puncture", event.event_id, "report")
 
 
+def plans_to_send(record: CaseRecord) -> Iterator[Output]:
+    """Target and entry point, whenever they changed: for whoever asks for them."""
+    for event in plan_events(record):
+        yield Output("plan", event.event_id, "plan")
+
+
 def make_output(record: CaseRecord, output: Output) -> Path:
     """Return the file of the output, made now unless it lies there; durable when this returns.
 
@@ -91,7 +101,7 @@ def make_output(record: CaseRecord, output: Output) -> Path:
         return path
     buffer = io.BytesIO()
     try:
-        dataset = dataset_of(_finding(record, output), output)
+        dataset = _dataset(record, output)
         dataset.save_as(buffer, enforce_file_format=True)
     except OutputError:
         raise
@@ -104,6 +114,14 @@ def make_output(record: CaseRecord, output: Output) -> Path:
         record.seal_file(name, buffer.getvalue())
     _write(path, buffer.getvalue())
     return path
+
+
+def _dataset(record: CaseRecord, output: Output) -> Dataset:
+    if output.kind == "plan":
+        from service.dicom_out.plan_object import plan_of
+
+        return plan_of(record, output.number)
+    return dataset_of(_finding(record, output), output)
 
 
 def dataset_of(finding: Finding, output: Output) -> Dataset:

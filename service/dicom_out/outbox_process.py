@@ -14,6 +14,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
 
 import structlog
@@ -25,7 +26,7 @@ from case_record.record import CaseRecord, CaseRecordError
 from room_config.load import Config
 from room_config.shell import configure_logs, on_parent_gone
 from service.dicom_out.errors import OutputError
-from service.dicom_out.make import Output, make_output, outputs_to_send
+from service.dicom_out.make import Output, make_output, outputs_to_send, plans_to_send
 from service.dicom_out.outbox_sender import Sender
 from service.dicom_out.outbox_store import PRESENCE, OutboxStore, cases_with_open_deliveries
 
@@ -56,7 +57,7 @@ class Maker:
         if now == self._seen or time.monotonic() < self._again_s:
             return
         settled = self._settled_measurement()
-        new = outputs_to_send(self._record, self._after)
+        new = chain(outputs_to_send(self._record, self._after), plans_to_send(self._record))
         wanted = [one for one in new if one.name not in self._known]
         for output in wanted:
             beat()

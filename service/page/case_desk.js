@@ -69,6 +69,6 @@ export const drawHolding = whenChanged(({ holding, folder, role, busy }) => {
     h("td", { class: "left" }, clock(held.first_received_s), held.slices > 1 ? ` to ${clock(held.last_received_s)}` : ""),
     h("td", { class: "left" }, held.reason),
     h("td", {}, folder && held.may_be_taken && role === "operator" ? take(held) : null)));
-  const head = T.columns.map((name) => h("th", { scope: "col" }, name));
+  const head = T.columns.map((name) => (name ? h("th", { scope: "col" }, name) : h("td", {})));
   replace(byId("holding"), h("table", {}, h("thead", {}, h("tr", {}, head)), h("tbody", {}, rows)));
 });

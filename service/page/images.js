@@ -12,7 +12,7 @@ import { levelsOf, SliceView } from "./slice_view.js";
 import { TEXTS } from "./texts.js";
 
 const { image: words } = TEXTS;
-const LAYOUTS = ["slice", "both", "reconstruction", "blend"];
+const LAYOUTS = ["slice", "both", "reconstruction", "blend", "residual"];
 const NARROW_PX = 1100;
 // a fiducial is drawn on slices that lie this near to it, mm
 const SAME_SLICE_MM = 3;
@@ -29,14 +29,16 @@ export class Images {
     };
     this.slice = new SliceView(words.sliceNumber, on);
     this.sr = new SliceView(words.reconstruction, on);
+    this.residual = new SliceView(words.residual, on);
     this.picking = new Picking(this.slice, () => this.overlays());
     this.chosen = null; // a slice of before that the operator wants to see; null: the newest
     this.build();
-    this.setLayout(innerWidth < NARROW_PX ? "slice" : "both");
     this.loadSlice = whenChanged(({ id }) => this.fetchSlice(id));
     this.loadSr = whenChanged(({ id }) => this.fetchSr(id));
+    this.loadResidual = whenChanged((id) => this.fetchResidual(id));
     this.drawOverlay = whenChanged(() => this.overlays());
     this.listSlices = whenChanged(() => this.list.refresh(this.shownId()).catch(() => { /* the stream says when the service is back */ }));
+    this.setLayout(innerWidth < NARROW_PX ? "slice" : "both");
     setInterval(() => this.tickAge(), 500);
   }
 
@@ -50,8 +52,9 @@ export class Images {
     this.smooth = button(words.smooth, () => this.toggleSmooth(), { "aria-pressed": "false" });
     this.profile = button(words.profile, () => this.toggleProfile(), { "aria-pressed": "false", id: "profile" });
     this.newest = button(words.newest, () => this.choose(null), { hidden: true, id: "newest-slice" });
+    this.camera = h("a", { hidden: true, id: "camera", target: "_blank", rel: "noopener" }, words.camera);
     const bar = h("div", { class: "bar" },
-      h("span", { class: "group", role: "group", "aria-label": words.which }, this.buttons), this.newest,
+      h("span", { class: "group", role: "group", "aria-label": words.which }, this.buttons), this.newest, this.camera,
       h("label", {}, words.window, " ", this.window), h("label", {}, words.level, " ", this.level),
       button(words.auto, () => { this.manual = null; this.repaint(); }),
       this.shareLabel, this.smooth, this.profile, h("span", { class: "push" }),
@@ -66,7 +69,7 @@ export class Images {
     this.ageText = h("span", { id: "image-age" });
     this.source = h("span", {});
     replace(this.root, bar,
-      h("div", { class: "stage" }, strip, h("div", { class: "views" }, this.slice.root, this.sr.root, h("section", { id: "needle", class: "view", "aria-labelledby": "h-needle", hidden: true }))),
+      h("div", { class: "stage" }, strip, h("div", { class: "views" }, this.slice.root, this.sr.root, this.residual.root, h("section", { id: "needle", class: "view", "aria-labelledby": "h-needle", hidden: true }))),
       h("div", { class: "read" }, this.ageText, this.source, this.cursor));
     this.list = new SliceList(strip, (row) => this.choose(row));
   }
@@ -86,7 +89,9 @@ export class Images {
   }
 
   placeViews() {
-    this.sr.root.hidden = this.layout === "slice" || this.layout === "blend" || this.showsNeedle();
+    this.sr.root.hidden = !["both", "reconstruction"].includes(this.layout) || this.showsNeedle();
+    this.residual.root.hidden = this.layout !== "residual";
+    if (this.layout === "residual" && this.state?.measurement?.state === "done") this.loadResidual(this.state.measurement.measurement_id);
     const needle = this.root.querySelector("#needle");
     if (needle) needle.hidden = !this.showsNeedle();
   }
@@ -98,6 +103,8 @@ export class Images {
     // a new slice is what matters: it is shown, unless somebody picks on an older one just now
     if (before && state.slice?.slice_id !== before && !this.picking.isOn) this.chosen = null;
     this.newest.hidden = !this.chosen;
+    this.camera.hidden = !state.camera_preview_url;
+    if (state.camera_preview_url) this.camera.href = state.camera_preview_url;
     this.picking.draw(state, role);
     if (state.slice) this.loadSlice({ id: this.shownId() });
     if (state.reconstruction) this.loadSr({ id: state.reconstruction.measurement_id });
@@ -145,6 +152,22 @@ export class Images {
     this.overlays();
   }
 
+  // What the fit leaves, in grey around nothing: white and black are four standard deviations away.
+  async fetchResidual(id) {
+    const { slice, measurement } = this.state;
+    try {
+      const pixels = await getPixels(ofCase(`api/v1/measurements/${id}/residual`));
+      const left = pixels.values.filter((value) => value !== 0);
+      const deviation = Math.sqrt(left.reduce((sum, value) => sum + value * value, 0) / Math.max(1, left.length));
+      const first = !this.residual.geometry;
+      this.residual.show(slice, pixels, words.residualOf(measurement.slice_id, measurement.chi2_per_dof?.toFixed(2), measurement.method));
+      this.residual.paint({ window: 8 * deviation, level: 0 });
+      if (first) this.zoomToFiducial();
+    } catch (error) {
+      this.residual.clear(error.message);
+    }
+  }
+
   // Window and level: automatic for each image, or one choice relative to the automatic one. The
   // automatic one spans the whole fiducial: its plateau and edge are not burnt out.
   levels(view) {
@@ -160,6 +183,7 @@ export class Images {
     const blended = this.layout === "blend" && this.sr.pixels ? this.sr.pixels : null;
     if (this.slice.pixels) this.slice.blend(blended, blended ? this.levels(this.sr) : {}, this.share.value / 100);
     if (!this.sr.pixels) this.sr.clear(words.noReconstruction);
+    if (!this.residual.pixels) this.residual.clear(words.noResidual);
   }
 
   slid() {
@@ -188,7 +212,7 @@ export class Images {
   }
 
   shown() {
-    return [this.slice, this.sr].filter((view) => !view.root.hidden);
+    return [this.slice, this.sr, this.residual].filter((view) => !view.root.hidden);
   }
 
   zoomToFiducial() {
@@ -202,8 +226,8 @@ export class Images {
 
   // Side by side, both views look at the same place.
   follow(view) {
-    const other = view === this.slice ? this.sr : this.slice;
-    if (this.layout !== "both" || this.chosen || !other.geometry || (other.zoom === view.zoom && String(other.middle) === String(view.middle))) return;
+    const other = view !== this.slice ? this.slice : this.layout === "residual" ? this.residual : this.sr;
+    if (!["both", "residual"].includes(this.layout) || this.chosen || !other.geometry || (other.zoom === view.zoom && String(other.middle) === String(view.middle))) return;
     other.zoom = view.zoom;
     other.middle = [...view.middle];
     other.place();

@@ -55,7 +55,7 @@ function showTable(box, words, rows, row) {
   const name = box.id;
   if (!rows.length) return replace(box, h("p", { class: "quiet" }, words.none));
   const shown = opened.has(name) ? rows : rows.slice(0, FEW_ROWS);
-  const table = h("table", {}, h("thead", {}, h("tr", {}, words.columns.map((column) => h("th", { scope: "col" }, column)))), h("tbody", {}, shown.map(row)));
+  const table = h("table", {}, h("thead", {}, h("tr", {}, words.columns.map((column) => (column ? h("th", { scope: "col" }, column) : h("td", {}))))), h("tbody", {}, shown.map(row)));
   const toggle = () => { if (!opened.delete(name)) opened.add(name); showTable(box, words, rows, row); };
   replace(box, table, rows.length > FEW_ROWS ? h("button", { type: "button", class: "small more", onclick: toggle }, opened.has(name) ? TEXTS.events.fewer : TEXTS.events.more) : null);
 }

@@ -28,9 +28,9 @@ function drawing([axis, sign, letters], down, { entry, target, fiducials, arriva
   high[0] += spare;
   const line = (from, to, kind) => s("line", { x1: at(from)[0], y1: at(from)[1], x2: at(to)[0], y2: at(to)[1], class: `thin ${kind}` });
   const text = (x, y, anchor, content) => s("text", { x, y, "text-anchor": anchor, "font-size": TEXT_MM }, content);
-  const point = (pointMm, kind, name) => {
+  const point = (pointMm, kind, name, way = 1) => {
     const [x, y] = at(pointMm);
-    return [s("circle", { cx: x, cy: y, r: 1.6, class: `thin ${kind}` }), text(x + 3, y + 1.6, "start", name)];
+    return [s("circle", { cx: x, cy: y, r: 1.6, class: `thin ${kind}` }), text(x + way * 3, y + 1.6, way > 0 ? "start" : "end", name)];
   };
   const [first, second] = fiducials;
   const [near, far] = down > 0 ? [words.front, words.back] : [words.back, words.front];
@@ -44,7 +44,7 @@ function drawing([axis, sign, letters], down, { entry, target, fiducials, arriva
     entry ? point(entry, "c-entry", words.entry) : null,
     target ? point(target, "c-target", words.target) : null,
     fiducials.map((one) => point(one.patient_mm, "c-fiducial", words[one.name] ?? one.name)),
-    arrival?.tip_mm ? point(arrival.tip_mm, "c-plan", words.tip) : null);
+    arrival?.tip_mm ? point(arrival.tip_mm, "c-plan", words.tip, -1) : null);
 }
 
 export const drawNeedle = whenChanged((seen) => {

@@ -9,6 +9,7 @@ import { TEXTS } from "./texts.js";
 
 const { pick: words } = TEXTS;
 const NUDGE_MM = 0.1;
+const ASK_AFTER_MS = 250;
 
 export class Picking {
   // view: the SliceView on which is picked; onMoved: the point is elsewhere now
@@ -97,9 +98,31 @@ export class Picking {
       const to = pixelFromPatient(slice, pointMm);
       const offset = to.map((value, k) => (value - from[k]) * slice.spacing_mm[k]);
       parts.push(words.distance(mm(Math.hypot(...offset), 2), inWords(slice, ...offset)));
-      if (!this.state.guide) parts.push(reach(offset, belief?.calibration?.per_axis, robot));
+      if (this.state.guide) this.askReach(pointMm);
+      parts.push(this.state.guide ? this.toldReach(pointMm) : reach(offset, belief?.calibration?.per_axis, robot));
     }
-    setText(this.facts, parts.join(" "));
+    setText(this.facts, parts.filter(Boolean).join(" "));
+  }
+
+  // With four axes the line from entry to target decides: the service works it out.
+  askReach(pointMm) {
+    const asked = JSON.stringify([pointMm, this.state.entry_patient_mm, this.state.robot.positions_um, this.inTissue.checked]);
+    if (asked === this.asked) return;
+    this.asked = asked;
+    clearTimeout(this.asking);
+    this.asking = setTimeout(async () => {
+      try {
+        const { verdict, text } = await order("POST", "api/v1/target/reach", { patient_mm: pointMm, in_water: this.inTissue.checked });
+        this.told = { of: String(pointMm), words: words.told[verdict](text) };
+      } catch (error) {
+        this.told = { of: String(pointMm), words: error.message };
+      }
+      if (this.isOn && this.asked === asked) this.say(this.point);
+    }, ASK_AFTER_MS);
+  }
+
+  toldReach(pointMm) {
+    return this.told?.of === String(pointMm) ? this.told.words : "";
   }
 
   async set(what) {

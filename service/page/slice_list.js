@@ -85,7 +85,7 @@ export class SliceList {
       "aria-label": words.show(row.slice_id, words.kinds[kind] ?? kind, where), title: row.reason || clock(row.received_s),
       onclick: () => this.onChosen(row),
     },
-    h("img", { src: ofCase(`api/v1/slices/${row.slice_id}/image.png`), alt: "", loading: "lazy" }),
+    h("img", { src: ofCase(`api/v1/slices/${row.slice_id}/image.png`), alt: "", loading: "lazy", onerror: (event) => event.target.classList.add("missing") }),
     h("span", { class: "tag" }, `${row.slice_id} ${words.kinds[kind] ?? kind}`, where ? h("br", {}) : null, where));
   }
 }

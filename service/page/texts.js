@@ -76,7 +76,8 @@ export const TEXTS = {
   },
 
   image: {
-    layouts: { slice: "Slice", both: "Both", reconstruction: "Reconstruction", blend: "Blended" },
+    layouts: { slice: "Slice", both: "Both", reconstruction: "Reconstruction", blend: "Blended", residual: "Residual" },
+    residual: "Residual", residualOf: (id, chi2, method) => `Slice ${id} − disc${chi2 ? `, χ² ${chi2} per degree of freedom (${method})` : ""}`, noResidual: "No fitted model yet.",
     which: "Image shown", window: "Window", level: "Level", auto: "Auto", blend: "Blend", smooth: "Smooth", profile: "Profile",
     zoom: "Zoom", zoomIn: "Zoom in", zoomOut: "Zoom out", whole: "Whole", fiducial: "Fiducial",
     noSlice: "No slice yet.", noReconstruction: "No reconstruction yet: it needs slices at several commanded shifts.",
@@ -87,7 +88,7 @@ export const TEXTS = {
     age: (id, at, age) => `Slice ${id}: received ${at}, ${age} ago`, source: (state, time) => `${state}${time ? ` · time from ${time}` : ""}`,
     cursor: (words, row, col, value) => `${words}  ·  row ${row}  column ${col}  ·  value ${value}`,
     profileOf: (row) => `Intensity along row ${row} (solid) and its column (dashed) through the fiducial, mm from its centre`,
-    newest: "Newest",
+    newest: "Newest", camera: "Camera",
   },
   strip: {
     heading: "Slices of this case", newer: "Newer slices", older: "Older slices", empty: "No slices.",
@@ -106,6 +107,7 @@ export const TEXTS = {
     reachable: "Within the robot's travel.", unreachable: (axis, mm, low, high) => `Out of reach: axis ${axis} would have to go to ${mm} mm (travel ${low} to ${high} mm).`,
     empty: (field) => `Not set: ${field} is empty.`,
     reachUnknown: "Reach is known after a calibration.",
+    told: { within: () => "Within the robot's travel.", out: (why) => `Out of reach: ${why}.`, unknown: (why) => `${why.charAt(0).toUpperCase()}${why.slice(1)}.` },
     setTarget: "Set target", setEntry: "Set entry point", withdraw: "Withdraw the target", cancel: "Cancel",
     notSlice: "The point lies in the slice shown.",
   },

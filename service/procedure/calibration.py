@@ -213,13 +213,20 @@ def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
         _check,
         look_by_template if arguments.localization == TEMPLATE else None,
     )
-    if arguments.last is not None:
-        last, scale_error = ImageJacobian.from_json(arguments.last), arguments.gate.scale_error
-        same_mount = arguments.same_mount
-        _refuse(
-            lambda: found.jacobian.check_is_of_same_robot(last, scale_error, same_mount=same_mount)
-        )
+    check_is_as_last(found, arguments.last, arguments.gate, same_mount=arguments.same_mount)
     return (yield from _refine(found, arguments))
+
+
+def check_is_as_last(
+    found: Calibration, last: Mapping[str, Any] | None, gate: ValidationGate, *, same_mount: bool
+) -> None:
+    """Refuse what is not as the last image Jacobian (JSON) of this robot, if there was one."""
+    if last is None:
+        return
+    before, scale_error = ImageJacobian.from_json(last), gate.scale_error
+    _refuse(
+        lambda: found.jacobian.check_is_of_same_robot(before, scale_error, same_mount=same_mount)
+    )
 
 
 def drive_and_learn(

@@ -4,11 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from service.procedure.calibration import DISC, Calibration, Templates, drive_and_learn
+from service.procedure.calibration import (
+    DISC,
+    Calibration,
+    Templates,
+    check_is_as_last,
+    drive_and_learn,
+)
 from service.procedure.estimate import FiducialEstimate
 from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_looking import BothSeen, gates, see_both
@@ -30,7 +37,10 @@ _SHARE_TOLERANCE = 0.35
 
 @dataclass(frozen=True)
 class GuideCalibrationArguments:
-    """axes: the top stage's two, then the bottom stage's two."""
+    """axes: the top stage's two, then the bottom stage's two.
+
+    last: this robot's last image Jacobian with four axes; same_mount: not mounted anew since.
+    """
 
     axes: tuple[str, str, str, str]
     origin_um: Mapping[str, int]
@@ -38,6 +48,8 @@ class GuideCalibrationArguments:
     geometry: GuideGeometry
     gate: ValidationGate
     localization: str = DISC
+    last: Mapping[str, Any] | None = None
+    same_mount: bool = False
 
 
 def calibrate_guide(arguments: GuideCalibrationArguments) -> ProcedureSteps[Calibration]:
@@ -67,16 +79,16 @@ def calibrate_guide(arguments: GuideCalibrationArguments) -> ProcedureSteps[Cali
             answers.append((yield from ask(step, Measured)))
         return tuple(answers)
 
-    return (
-        yield from drive_and_learn(
-            _places(arguments),
-            ImageJacobian.unknown(arguments.axes),
-            arguments.gate,
-            look,
-            lambda jacobian: _check_shares(jacobian, arguments.geometry),
-            look_by_template if arguments.localization == TEMPLATE else None,
-        )
+    found = yield from drive_and_learn(
+        _places(arguments),
+        ImageJacobian.unknown(arguments.axes),
+        arguments.gate,
+        look,
+        lambda jacobian: _check_shares(jacobian, arguments.geometry),
+        look_by_template if arguments.localization == TEMPLATE else None,
     )
+    check_is_as_last(found, arguments.last, arguments.gate, same_mount=arguments.same_mount)
+    return found
 
 
 def _places(arguments: GuideCalibrationArguments) -> list[dict[str, int]]:

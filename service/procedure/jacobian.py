@@ -153,5 +153,8 @@ class ImageJacobian:
 
 
 def _shape(columns: Array) -> Array:
-    """The columns turned and mirrored into a standard pose: what is left is lengths and angles."""
-    return np.asarray(np.linalg.cholesky(columns.T @ columns).T)
+    """Each stage's two columns turned and mirrored into a standard pose: what is left is lengths
+    and angles.
+    """
+    stages = (columns[:, at : at + 2] for at in range(0, columns.shape[1], 2))
+    return np.hstack([np.linalg.cholesky(stage.T @ stage).T for stage in stages])

@@ -13,19 +13,27 @@ _SHOWN_S = 300.0
 _MOST_RAISED = 20
 _SEE_LOG = "See the log of the process that raised this alarm."
 # what to do about what the listener raises, by its code
-_TO_DO = {
+TO_DO = {
+    "association_ended": "Check the cable and the scanner; send again what did not arrive.",
     "association_rejected": "Check AE titles and addresses at the scanner and in the room's file.",
     "clock_drift": "Compare the scanner clock again, then acquire the slices again.",
+    "clock_jump": "Compare the scanner clock again, then acquire the slices again.",
+    "commitment_unreported": "Check commitment_reports_to in the room's file; the slices are safe.",
     "contexts_refused": "Set the scanner to send uncompressed MR Image Storage.",
     "disk_low": "Free space on the disk that holds the case folder.",
     "foreign_file": "Inspect the file in the inbox and remove it.",
     "intake_failed": "Acquire the slice again; see the listener's log.",
     "late_or_clock_jump": "Compare the scanner clock again, then acquire the slices again.",
+    "many_slices_wait": "Send only what is asked for; compare the clocks.",
     "oversize": "Check what the scanner is sending: no slice is that large.",
+    "push_delay_unlike_measured": "Compare the clocks; if it stays so, commission the site again.",
     "same_uid_other_bytes": "Acquire the slice again; check which systems send to this listener.",
     "slice_refused": "Send or acquire the slice again.",
     "unfinished_files": "Nothing is lost: the scanner was never told that they had arrived. Send "
     "them again.",
+    "watch_dir_gone": "Restore the share; until then send by C-STORE.",
+    "watch_dir_refused": "Export the file again.",
+    "wrong_duration": "Acquire the slice again; report the value to the scanner's vendor.",
 }
 
 
@@ -72,7 +80,7 @@ class AlarmBook:
                         code=str(event.body["alarm"]),
                         severity="warning",
                         text=str(event.body["text"]),
-                        what_to_do=_TO_DO.get(str(event.body["alarm"]), _SEE_LOG),
+                        what_to_do=TO_DO.get(str(event.body["alarm"]), _SEE_LOG),
                         since_s=event.wall_s,
                     )
                 )

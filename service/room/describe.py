@@ -84,7 +84,8 @@ class Describer:
         self._alarms = AlarmBook()
         self._proposals = ProposalBook()
         self._around_id = 0
-        self._believed_at = (-1, -1)
+        self._believed_at = self._counted_at = (-1, -1)
+        self._counted: dict[str, int] = {}
 
     def describe(self, execution: Execution, before: RoomState) -> RoomState:
         """Return the present state; the revision grows only if something else than time changed."""
@@ -119,7 +120,7 @@ class Describer:
                 "robot": describe_robot(link, before.robot),
                 "jog_possible": may_start(record, now) is None,
                 "hold": _hold(record),
-                **_slices(record),
+                **_slices(record, self._counts()),
                 "measurement": _measurement(record, measurement, now),
                 **self._around(measurement, before),
                 **clock_update(config, record, time.time()),
@@ -153,6 +154,13 @@ class Describer:
             "reconstruction": describe_reconstruction(self._record, before.reconstruction, last),
             "other_fiducial": describe_other_fiducial(self._record, last),
         }
+
+    def _counts(self) -> dict[str, int]:
+        """Slices by state; counted anew when the record has changed: there may be thousands."""
+        changes = self._record.change_count()
+        if changes != self._counted_at:
+            self._counted_at, self._counted = changes, self._record.count_slices()
+        return self._counted
 
     def _believed(self, before: RoomState) -> BeliefState:
         """What the system believes; worked out anew when the record has changed."""
@@ -253,14 +261,14 @@ def _hold(record: CaseRecord) -> HoldState | None:
     return HoldState(hold_id=hold.hold_id, set_id=hold.set_id, settled_at_s=hold.settled_at_s)
 
 
-def _slices(record: CaseRecord) -> dict[str, Any]:
+def _slices(record: CaseRecord, counts: dict[str, int]) -> dict[str, Any]:
     """How many there are, the last one, and the one that is shown."""
     last = record.last_slice()
     shown = record.last_slice("assigned") or last
     return {
         "last_slice_id": last.slice_id if last else None,
         "last_slice_received_s": last.received_s if last else None,
-        "slices": record.count_slices(),
+        "slices": counts,
         "slice": _slice(shown) if shown else None,
     }
 

@@ -17,9 +17,12 @@ from case_record.record import CaseRecord
 from case_record.seals import TamperedError
 from dicom_slice.pixels import magnitude_pixels
 from dicom_slice.reasons import Reason, UnusableError
+from sr_engine.request import recorded_point_spread
+from sr_engine.residual import residual_image
 
 _MOST_SIDE_PX = 4096
 _WINDOW_PERCENT = (1.0, 99.8)
+_FITTED = ("ml", "template")
 
 
 class ImageMissingError(Exception):
@@ -74,6 +77,21 @@ def load_reconstruction(case_dir: Path, result: Mapping[str, Any]) -> NDArray[np
         raise TamperedError(f"{path} is not the image that was made")
     pixels: NDArray[np.float64] = np.load(io.BytesIO(content)).astype(np.float64)
     return pixels
+
+
+def residual_pixels(record: CaseRecord, measurement_id: int) -> NDArray[np.float64]:
+    """Return the newest slice of a measurement less a disc where the fiducial was found.
+
+    (rows, cols) of that slice, 0 far from it; raises ImageMissingError where it was found by one of
+    the paper's methods, which fit no disc.
+    """
+    result = record.measurement(measurement_id).result or {}
+    psf = recorded_point_spread(result)
+    if result.get("method") not in _FITTED or psf is None:
+        raise ImageMissingError(f"measurement {measurement_id} has no fitted model")
+    row, col = result["centre_px"]
+    frame = slice_pixels(record, result["slice_id"])
+    return residual_image(frame, (row, col), result["radius_px"], psf)
 
 
 def png_of(pixels: NDArray[np.floating], how: Rendering = Rendering()) -> bytes:

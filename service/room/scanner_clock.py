@@ -41,7 +41,7 @@ def implied(config: Config, compared: ClockState | None, now_s: float) -> str:
         return f"Not compared: slices are judged by the delay measured here, at most {most_s:g} s."
     ends_s = _made_s(compared) + 60 * config.listener.comparison_valid_min
     if now_s < ends_s and most_s is None and config.listener.clock_may_be_set:
-        return f"Used at the hold at which it was made. At others, {_WAITS}."
+        return f"Valid for the hold at which it was made. For others, {_WAITS}."
     if now_s < ends_s:
         wait_s = start_margin_s(config, compared, now_s)
         return f"Used for slices acquired {wait_s:.1f} s or more after the robot settled."
@@ -168,7 +168,7 @@ def clock_was_set(config: Config, record: CaseRecord) -> list[Condition]:
     step = _last_step(record)
     if step is None:
         return []
-    waits = "" if config.listener.prompt_delay_s is not None else ": slices wait"
+    waits = "" if config.listener.prompt_delay_s is not None else ": slices stay pending"
     text = f"{step.body['why'][:1].upper()}{step.body['why'][1:]}{waits}"
     return [Condition("clock_set", "alarm", text, "Compare it with the scanner's clock.")]
 

@@ -281,6 +281,7 @@ class RoomState(_Frozen):
     punctured: bool = False
     jog_possible: bool = False
     arrival_mode: bool = False
+    camera_preview_url: str = ""
     processes: list[ProcessState] = []
     alarms: list[AlarmState] = []
     belief: BeliefState | None = None
@@ -296,6 +297,7 @@ class RoomState(_Frozen):
             cases_begin_here=config.room.cases_dir is not None,
             virtual=config.room.virtual,
             arrival_mode=config.listener.arrival_mode,
+            camera_preview_url=config.service.camera_preview_url,
             guide=config.service.guide is not None,
             ready_valid_s=config.service.ready_valid_s,
             tolerance_mm=(config.service.guide or config.service).tolerance_mm,

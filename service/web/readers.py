@@ -33,7 +33,7 @@ from service.web.routes.record import event_router, measurement_router, slice_ro
 
 _READ = re.compile(
     r"/api/v1/(events|cases|targets|measurements|slices(/[^/]+)?"
-    r"|(measurements|slices)/[^/]+/(image\.png|pixels))"
+    r"|(measurements|slices)/[^/]+/(image\.png|pixels|residual))"
 )
 _MOST_WAITING = 200
 _PATIENCE_S = 20.0

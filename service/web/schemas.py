@@ -64,6 +64,19 @@ class TargetBody(PointBody):
     )
 
 
+class ReachAsk(PointBody):
+    """A point that might become the target."""
+
+    in_water: bool = False
+
+
+class ReachBody(BaseModel):
+    """Whether the robot could bring the guide there, and why not, or why nobody can tell."""
+
+    verdict: Literal["within", "out", "unknown"]
+    text: str
+
+
 class TakeBody(Ask):
     """Take a proposal over; what only the operator can say must be said."""
 

@@ -28,6 +28,7 @@ class BenchDemoRoom(DemoRoom):
         super().__init__(options)
         self.camera = camera
         self.preview_url = ""
+        self.service: dict[str, Any] = {}
 
     @property
     def lens_file(self) -> Path:
@@ -57,11 +58,14 @@ class BenchDemoRoom(DemoRoom):
         tables["imaging"].update(
             fiducial_radius_min_mm=RADIUS_MM[0], fiducial_radius_max_mm=RADIUS_MM[1]
         )
+        tables["service"].update(self.service)
         tables["camera"] = {
             "source": url,
             "lens_file": "lens.json",
             "service_url": f"http://127.0.0.1:{tables['service']['port']}",
             "preview_port": 0,
+            # the camera is rendered on this computer, which has other things to do
+            "stall_s": 30.0,
             **self.camera,
         }
 

@@ -95,7 +95,7 @@ def test_where_the_clock_may_have_been_set_unseen_a_slice_waits_for_another_comp
     waiting = decide(offset=replace(SAME_CLOCK, low_if_set_s=-20.0))
     assert isinstance(waiting, Pending)
     assert why(waiting) == Reason.CLOCK_UNKNOWN
-    assert "not compared since hold 1 settled" in waiting.text
+    assert "not been compared since hold 1 settled" in waiting.text
     assert isinstance(decide(offset=replace(SAME_CLOCK, low_if_set_s=-9.9)), Assigned)
     before = replace(STANDING, settled_at_s=1000.5)
     assert why(decide(holds=[before], offset=replace(SAME_CLOCK, low_if_set_s=0.6))) == (
@@ -225,7 +225,7 @@ troubles = st.builds(
 )
 
 
-@settings(max_examples=300, deadline=None, derandomize=True)
+@settings(max_examples=150, deadline=None, derandomize=True)
 @given(trouble=troubles, seed=st.integers(0, 2**32), n_holds=st.integers(1, 8))
 def test_no_slice_is_ever_used_for_a_hold_at_which_it_was_not_acquired(trouble, seed, n_holds):
     trouble = one_at_a_time(trouble, is_held_up=seed % 3 == 0)
@@ -295,7 +295,7 @@ def campaign(knowledge: str, n_days: int, first_seed: int, troubles=any_trouble)
 
 @pytest.mark.parametrize("knowledge", ["comparison", "promptness", "both"])
 def test_a_short_campaign_of_bad_days_assigns_much_and_nothing_wrongly(knowledge):
-    sums = campaign(knowledge, 300, first_seed=0)
+    sums = campaign(knowledge, 200, first_seed=0)
     assert sums.wrong == []
     assert sums.share > 0.15
 
@@ -346,12 +346,12 @@ def test_the_generator_does_catch_an_assignment_that_is_too_trusting():
         def bounds_of(self, arrival):
             return OffsetBounds(self.first_offset_s, self.first_offset_s)
 
-    wrong = 0
-    for seed in range(100):
+    def is_wrong(seed: int) -> bool:
         dice = random.Random(seed)
         trouble = replace(any_trouble(dice, "comparison"), steps=3, early=0.5)
-        wrong += len(Trusting(dice, trouble).run(6).wrong)
-    assert wrong > 0
+        return bool(Trusting(dice, trouble).run(6).wrong)
+
+    assert any(is_wrong(seed) for seed in range(100))
 
 
 def test_the_generator_does_catch_a_promptness_that_nobody_measured():
@@ -361,9 +361,9 @@ def test_the_generator_does_catch_a_promptness_that_nobody_measured():
         def commissioned(self):
             return Promptness(0.0, 3.0)
 
-    wrong = 0
-    for seed in range(300):
+    def is_wrong(seed: int) -> bool:
         dice = random.Random(seed)
         trouble = replace(any_trouble(dice, "promptness"), delays="regular", early=0.5)
-        wrong += len(Assuming(dice, trouble).run(6).wrong)
-    assert wrong > 0
+        return bool(Assuming(dice, trouble).run(6).wrong)
+
+    assert any(is_wrong(seed) for seed in range(300))

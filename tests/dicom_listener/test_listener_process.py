@@ -238,7 +238,7 @@ def test_a_comparison_counts_at_the_hold_that_stood_and_a_slice_at_the_next_one_
         send(listener.port, mr_data_set("1.2.1", began_s=began_s))
         waiting = rows(record, 1)[0]
         assert (waiting.state, waiting.reason_code) == ("pending", "clock_unknown")
-        assert f"not compared since hold {hold_id} settled" in waiting.reason
+        assert f"not been compared since hold {hold_id} settled" in waiting.reason
         sync_clock(record, 0.0, 0.05, "anna")
         wait_for(lambda: record.slices()[0].hold_id == hold_id)
 

@@ -136,10 +136,12 @@ def live_through(folder: Path, operations: list[Any], restarts: set[int]) -> Des
     return desk
 
 
-@pytest.mark.parametrize("first_seed", range(0, 24, 8))
-def test_a_restart_at_any_point_of_any_day_changes_no_decision(tmp_path, first_seed):
+@pytest.mark.parametrize(
+    "seeds", [range(8), pytest.param(range(8, 40), marks=pytest.mark.soak)], ids=["few", "many"]
+)
+def test_a_restart_at_any_point_of_any_day_changes_no_decision(tmp_path, seeds):
     assigned = 0
-    for seed in range(first_seed, first_seed + 8):
+    for seed in seeds:
         dice = random.Random(seed)
         operations = a_day(dice)
         restarts = {n for n in range(len(operations)) if dice.random() < 0.4}

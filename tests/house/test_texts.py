@@ -6,6 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from service.room.alarms import TO_DO
+
 ROOT = Path(__file__).parents[2]
 # a word that was given up in favour of another one, and that one
 INSTEAD = {
@@ -59,3 +61,14 @@ def test_a_word_that_was_given_up_does_not_come_back(texts, word):
         if re.search(word, text, re.IGNORECASE)
     ]
     assert not found, f"say {INSTEAD[word]!r}"
+
+
+def test_what_the_listener_raises_comes_with_what_to_do():
+    raised = re.compile(r'alarms?(?:\.append\()?\(+\s*"([a-z_]+)"')
+    kinds = {
+        kind
+        for path in (ROOT / "dicom_listener").rglob("*.py")
+        for kind in raised.findall(path.read_text())
+    }
+    assert {"clock_jump", "watch_dir_gone", "many_slices_wait"} <= kinds
+    assert kinds <= TO_DO.keys()

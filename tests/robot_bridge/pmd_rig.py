@@ -7,6 +7,7 @@ import threading
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
+from unittest.mock import patch
 
 from robot_bridge.daemon.config import AxisConfig
 from robot_bridge.daemon.motors import MotorStatus
@@ -148,15 +149,17 @@ def opened(made: Rig, drive: str = "open_loop", declare: bool = True, **changes:
         axis_config(name, made.url, address, drives[address - 1], **changes)
         for name, address in (("xt", 1), ("yt", 2))
     ]
-    # The emulator is a thread of this process; on a busy computer its answers take long.
+    # The emulator is a thread of this process; on a busy computer its answers take long. (The
+    # bounds of a stop are held on the line's own clock, in test_pmd401_moves.)
+    patient = patch.multiple(
+        "robot_bridge.pmd.stop", STOP_DEADLINE_S=2.0, STOP_ANSWER_TIMEOUT_S=0.5
+    )
     motors = PmdMotors(axes, timeout_s=0.5, **options)
-    try:
+    with patient, contextlib.closing(motors):
         motors.open()
         if declare:
             motors.declare_position({"xt": 0, "yt": 0})
         yield motors
-    finally:
-        motors.close()
 
 
 def finish(motors: PmdMotors, within_s: float = 60.0) -> MotorStatus:

@@ -374,8 +374,8 @@ def run_campaign(folder: Path, moves: int, first_seed: int) -> Counter[str]:
 
 
 def test_a_short_campaign(tmp_path: Path):
-    total = run_campaign(tmp_path, 250, 100)
-    assert total["move DONE"] > 100, total
+    total = run_campaign(tmp_path, 120, 100)
+    assert total["move DONE"] > 50, total
 
 
 @pytest.mark.soak

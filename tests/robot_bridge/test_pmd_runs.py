@@ -94,6 +94,25 @@ def test_a_stop_has_not_ended_before_the_encoder_was_asked_where_the_axis_stands
     assert abs(bench.truth_um("xt") - status.readback_um["xt"]) <= 2
 
 
+@pytest.mark.parametrize("latency_s", [0.0, 0.004, 0.03])
+def test_an_encoder_that_died_just_before_a_stop_is_within_what_is_said(latency_s: float):
+    """Nobody can have seen it: the last look was good, and there is no other."""
+    bench = Bench("closed_loop", latency_s)
+    bench.motors.move_to({"xt": 12_000})
+    while bench.truth_um("xt") < 3000:
+        bench.motors.poll()
+        bench.line.wait(0.005)
+    bench.boards[0].faults.encoder_frozen = True
+    bench.line.wait(0.05)
+    bench.motors.stop()
+    bench.poll_for(5.0)
+    bench.boards[0].faults.encoder_frozen = False
+    status = bench.motors.poll()
+    off_um = abs(bench.truth_um("xt") - status.readback_um["xt"])
+    assert off_um > 100
+    assert "xt" not in status.certain_axes or off_um <= status.within_um["xt"]
+
+
 def run_of(microsteps: int, sent_s: float, begun_by_s: float, polls: list[tuple]) -> Run:
     run = Run(0.0, microsteps, 1000, sent_s)
     run.begun_by_s = begun_by_s

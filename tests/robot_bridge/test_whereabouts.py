@@ -136,6 +136,6 @@ def test_a_stand_is_the_same_after_the_journal():
 
 def test_an_axis_that_stays_is_known_no_worse():
     known = Whereabouts({"xt": COUNTED}, {"xt": Stand(500, 10.0)})
-    known.arrived({"xt": 500}, ["xt"])
+    known.arrived({"xt": 500}, ["xt"], {})
     assert known.stands["xt"] == Stand(500, 10.0)
     assert known.reach_um("xt", 500) == (490, 510)

@@ -41,15 +41,15 @@ def laid_out(page: Page) -> None:
     )
 
 
-def serious_violations(page: Page) -> list[str]:
+def violations(page: Page) -> list[str]:
     """What axe finds wrong with the accessibility of what is shown now, in the theme of now."""
     # the page's own policy forbids foreign scripts, as it should: axe comes in through the debugger
     page.evaluate(AXE.read_text(encoding="utf-8") + "; null")
     found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
     return [
-        f"{v['id']}: {v['nodes'][0]['html'][:120]} {v['nodes'][0].get('failureSummary', '')[:300]}"
+        f"{v['impact']} {v['id']}: {v['nodes'][0]['html'][:120]} "
+        f"{v['nodes'][0].get('failureSummary', '')[:300]}"
         for v in found["violations"]
-        if v["impact"] in ("serious", "critical")
     ]
 
 

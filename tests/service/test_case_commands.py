@@ -15,6 +15,7 @@ from offline_arguments import approach_arguments, beside, calibration_arguments
 
 from case_record.record import FILE_NAME, CaseRecord
 from case_record.sealing import prepare
+from case_record.sql import MIGRATIONS
 from service.cli.replay import replay_measurements
 from service.procedure.registry import (
     APPROACH,
@@ -28,6 +29,7 @@ from service.procedure.registry import (
 )
 from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steps import Acquire
+from service.room.present import Now, why_not_now
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
 from sr_engine.reconstruction.shiftset import named
@@ -183,6 +185,43 @@ def test_a_folder_without_a_case_or_from_a_newer_version_is_refused_in_one_line(
     assert ended.returncode == 2
     assert "schema version 99, newer than" in ended.stderr
     assert len(ended.stderr.strip().splitlines()) == 1
+
+
+@pytest.fixture(scope="module")
+def older(case, tmp_path_factory):
+    """The case as the program of version 1 would have left it: its tables, its columns."""
+    folder = tmp_path_factory.mktemp("older") / "case"
+    shutil.copytree(case, folder)
+    (folder / FILE_NAME).unlink()
+    old = sqlite3.connect(folder / FILE_NAME)
+    old.executescript(MIGRATIONS[0])
+    old.execute("ATTACH ? AS new", (str(case / FILE_NAME),))
+    tables = [
+        row[0] for row in old.execute("SELECT name FROM main.sqlite_master WHERE type='table'")
+    ]
+    for table in tables:
+        columns = ", ".join(row[1] for row in old.execute(f'PRAGMA main.table_info("{table}")'))
+        old.execute(f'INSERT INTO main."{table}" ({columns}) SELECT {columns} FROM new."{table}"')
+    old.execute("PRAGMA user_version = 1")
+    old.commit()
+    old.close()
+    return folder
+
+
+@pytest.mark.parametrize("command", ["report", "export"])
+def test_a_record_of_version_1_is_read_and_stays_as_it_was(older, command, tmp_path):
+    before = {path: path.read_bytes() for path in older.rglob("*") if path.is_file()}
+    ended = autospine(command, older, "--out", tmp_path / "out")
+    assert (ended.returncode, ended.stderr) == (0, "")
+    with CaseRecord(older, read_only=True) as record:
+        assert record.was_older
+        record.verify()
+        assert record.measurements()
+        assert record.last_event("case_started").seq
+        # nothing that was measured then is true now
+        last = record.last_measurement("done")
+        assert why_not_now(record, last, Now(None, 300.0)).code in ("unknown", "no_link")
+    assert {path: path.read_bytes() for path in older.rglob("*") if path.is_file()} == before
 
 
 def test_replay_refuses_a_method_that_does_not_exist(case):

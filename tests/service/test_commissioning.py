@@ -3,17 +3,25 @@
 import random
 import tomllib
 from dataclasses import replace
+from pathlib import Path
 
+import numpy as np
 import pytest
 from virtual_commissioning import Truth, VirtualTechnologist
 
+from case_record.record import CaseRecord
 from room_config.imaging import ImagingConfig
 from room_config.load import load_config
 from service.commissioning.acceptance import as_toml, items_of, room_keys
 from service.commissioning.clocks import find_clock
 from service.commissioning.evidence import CommissioningError, Press, one_series
 from service.commissioning.imaging import find_imaging
+from service.commissioning.motion import jacobian_items, jacobian_of_case
 from service.commissioning.report import Signature, verdict_of, write_html, write_pdf
+from service.procedure.calibration import Calibration
+from service.procedure.estimate import FiducialEstimate
+from service.procedure.jacobian import ImageJacobian
+from service.procedure.plane import ImagePlane
 
 IMAGING = ImagingConfig(start_region_px=(30, 30, 98, 98))
 ROOM = '[room]\nname = "a site"\ncase_dir = "case"\n[service]\nbridge_link = "/dev/null"\n'
@@ -54,6 +62,7 @@ def test_a_commissioning_finds_each_within_its_stated_uncertainty(tmp_path, site
     assert imaging.psf.kind == window
     assert imaging.polarity == polarity
     assert abs(abs(imaging.oil_shift_px) - imaging.oil_expected_px) < 5 * imaging.oil_sigma_px
+    assert 0.7 < imaging.template_chi2 < 1.5
     # a sphere of 4 mm, averaged over a slice of 3 mm
     assert 3.7 < imaging.radius_mm < 4.05
     items = items_of(clock, imaging)
@@ -87,6 +96,7 @@ def test_times_that_are_not_true_are_found_out_and_nothing_is_written_of_the_clo
 def test_without_the_second_readout_the_polarity_is_not_known(session):
     imaging = find_imaging(session[:-1], IMAGING)
     assert imaging.polarity == 0
+    assert "sign of the readout changed" in imaging.template_problem
     assert "readout_polarity" not in room_keys(find_clock(session), imaging).get("imaging", {})
 
 
@@ -125,3 +135,32 @@ def test_what_is_written_is_toml(session):
     read = tomllib.loads(as_toml(keys, "measured on a day"))
     assert read["listener"]["prompt_delay_s"] >= 2.4
     assert read["imaging"]["point_spread"]["kind"] == "flat"
+
+
+JACOBIAN = ImageJacobian(
+    ("xt", "yt"),
+    np.array([[0.1, 0.1, 0.98, 0.96], [1.02, 1.0, -0.1, -0.1]]),
+    np.diag([0.01**2] * 8),
+)
+
+
+def calibrated_case(folder: Path, jacobian: ImageJacobian) -> Path:
+    with CaseRecord(folder, create=True) as record:
+        number = record.begin_procedure("calibration", {})
+        plane = ImagePlane((0.0, 0.0, -1.0), (1.0, 0.0, 0.0), (1.0, 1.0))
+        seen = FiducialEstimate({"xt": 0, "yt": 0}, np.zeros(2), np.eye(2))
+        found = Calibration(jacobian, seen, plane, 1).to_json()
+        record.end_procedure(number, "done", found)
+    return folder
+
+
+def test_the_image_jacobian_of_a_calibrated_case_is_part_of_the_acceptance(tmp_path):
+    found = jacobian_of_case(calibrated_case(tmp_path / "case", JACOBIAN))
+    xt, yt = jacobian_items(found, "case")
+    assert xt.value == "1.025 ± 0.010 mm per mm out, 1.005 ± 0.010 back"
+    assert (xt.passed, yt.passed) == (True, True)
+    half = ImageJacobian(JACOBIAN.axes, JACOBIAN.columns / 2, JACOBIAN.covariance)
+    assert "Image Jacobian" in verdict_of(jacobian_items(half, "case"))
+    CaseRecord(tmp_path / "other", create=True).close()
+    with pytest.raises(CommissioningError, match="no valid calibration"):
+        jacobian_of_case(tmp_path / "other")

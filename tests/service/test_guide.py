@@ -107,6 +107,17 @@ def calibrated(recorded):
     return room, room.run(calibrate_guide(calibration_arguments()))
 
 
+@pytest.mark.parametrize("same_mount", [True, False])
+def test_a_calibration_is_held_against_the_last_one_of_this_robot(recorded, same_mount):
+    again = calibration_arguments(last=recorded["jacobian"], same_mount=same_mount)
+    for seed in range(1, 4):
+        make_room(seed).run(calibrate_guide(again))
+    other = make_room(5)
+    other.nominal_step_um["xb"] = 4.5 / 0.8  # an axis that goes a fifth less far than it did
+    with pytest.raises(ProcedureFailedError, match=r"axis xb.*differs from the last calibration"):
+        other.run(calibrate_guide(again))
+
+
 def test_the_tip_is_linear_in_what_is_seen():
     room = make_room(0)
     for stage in ((0, 0, 0, 0), (5, -3, 1, 8), (-9, 2, 6, -7)):

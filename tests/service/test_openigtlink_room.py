@@ -9,7 +9,11 @@ from typing import Any
 import numpy as np
 import pytest
 from attended_room import AttendedRoom, arm, calibrated, running_room, stop_all, wait_for
+from browser import set_theme, violations
+from lone_service import CONFIG, ready_service
 from openigtlink_station import OwnStation, Station, station
+from page_states import SIZES, layout_faults
+from playwright.sync_api import expect
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 from pynetdicom import AE
@@ -393,6 +397,60 @@ def test_a_plan_by_dicom_is_a_proposal_like_the_others(room, port):
         with CaseRecord(room.folder) as record:
             turned_away = record.events_of_kind("proposal_turned_away")
         assert any("frame of reference" in e.body["why"] for e in turned_away)
+
+
+def test_a_proposal_is_refused_and_another_accepted_by_clicking(room, port, browser):
+    with RoomClient(room.url, by="Olga") as client, station("own", port) as screen:
+        calibrated(client)
+        page = browser.new_page(viewport={"width": 1280, "height": 800})
+        page.goto(room.url)
+        card = page.locator("#proposals")
+        refused, wanted = beside(client.state(), 2.0), beside(client.state(), 3.0)
+        screen.say("point", "L4", "TARGET", ras(refused))
+        expect(card.locator("li")).to_have_count(1)
+        expect(card).to_contain_text(f"({refused[0]:.2f}, ".replace("-", "−"))
+        for theme in ("dark", "light"):
+            set_theme(page, theme)
+            assert violations(page) == []
+        for width, height in SIZES:
+            page.set_viewport_size({"width": width, "height": height})
+            assert layout_faults(page) == []
+        card.get_by_label("Why not").fill("a vessel is in the way")
+        card.get_by_role("button", name="Refuse").click()
+        told = screen.wait_for(lambda m: target_status(m) and m["code"] == 5)
+        assert "a vessel is in the way" in told["text"]
+        expect(card).to_be_hidden()
+
+        since = screen.mark()
+        screen.say("point", "L5", "ENTRY", ras(beside(client.state(), 4.0)), "TARGET", ras(wanted))
+        expect(card.locator("li")).to_have_count(1)
+        card.get_by_role("button", name="Accept: as the fiducial appears").click()
+        screen.wait_for(lambda m: target_status(m) and m["name"] == "taken", since)
+        expect(card).to_be_hidden()
+        assert client.state().target_patient_mm == pytest.approx(wanted, abs=1e-3)
+        assert_shows_what_the_page_shows(screen, client)
+        page.close()
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_when_a_case_ends_and_the_next_begins_nothing_of_it_is_shown_any_more(kind, tmp_path):
+    config = CONFIG.replace('case_dir = "case"', 'cases_dir = "cases"') + TABLE
+    with (
+        ready_service(tmp_path, config=config) as ready,
+        RoomClient(ready["url"], by="Olga") as client,
+        station(kind, int(ready["openigtlink"].rpartition(":")[2])) as screen,
+    ):
+        for number in (1.0, 2.0):
+            client.begin_case(f"case {number:g}")
+            assert_shows_what_the_page_shows(screen, client)
+            assert not shown_points(screen, "Targets")
+            client.set_entry((1.0, 2.0, 30.0 + number))
+            client.set_target((1.0, 2.0, number))
+            assert_shows_what_the_page_shows(screen, client)
+            assert set(shown_points(screen, "Targets")) == {"target", "entry"}
+            client.finish_case()
+            assert_shows_what_the_page_shows(screen, client)
+            assert not shown_points(screen, "Targets")
 
 
 def test_pyigtl_plans_and_stops(room, port):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import ssl
 import subprocess
 import time
@@ -34,6 +36,7 @@ from case_record.record import CaseRecord
 from room_config.load import ConfigError, load_config
 from service.dicom_out.make import FOLDER, make_output, outputs_to_send
 from service.dicom_out.outbox_store import OutboxStore
+from service.dicom_out.outbox_watch import OutboxWatch
 
 DESTINATION = """
 [[outputs.destination]]
@@ -206,6 +209,33 @@ def test_a_destination_that_keeps_silent_does_not_hold_up_another_one(case_dir, 
             wait_until(lambda: silent.received)
             wait_until_sent(case_dir)
         assert len(set(archive.uids)) == len(states(case_dir))
+
+
+def test_what_fails_in_the_watch_ends_neither_it_nor_the_outbox(case_dir, archive, monkeypatch):
+    """An error in the watch's own work is one look's, and an outbox that is killed comes again."""
+    look, failed = OutboxWatch._look, []
+
+    def fails_at_first(watch):
+        if len(failed) < 2:
+            failed.append(watch)
+            raise TypeError("injected")
+        look(watch)
+
+    monkeypatch.setattr(OutboxWatch, "_look", fails_at_first)
+    watch = OutboxWatch(room(case_dir, {"name": "archive", "port": archive.port}))
+    watch.start()
+    try:
+        wait_until_sent(case_dir)
+        assert len(failed) == 2
+        sole = case_dir / "processes" / "outbox.sole"
+        first = int(sole.read_text())
+        os.kill(first, signal.SIGKILL)
+        wait_until(lambda: int(sole.read_text() or first) != first)
+        with CaseRecord(case_dir) as record:
+            add_measurement(record)
+        wait_until_sent(case_dir)
+    finally:
+        watch.close()
 
 
 def test_an_object_at_which_the_receiver_breaks_off_holds_up_no_other(case_dir, archive):

@@ -20,7 +20,9 @@ from receivers import free_port, needs_program
 from recorded_case import come_to_ready, make_case, puncture
 
 from case_record.record import CaseRecord
-from service.dicom_out.make import Output, make_output, outputs_to_send
+from dicom_slice.plan import plan_in
+from service.dicom_out.identity import MAKER
+from service.dicom_out.make import Output, make_output, outputs_to_send, plans_to_send
 
 # What the validators say of every case, and why it is so. docs/dicom_outputs.md has the same table.
 EXPLAINED = {
@@ -39,7 +41,8 @@ def objects(tmp_path_factory: pytest.TempPathFactory) -> list[Path]:
     with CaseRecord(case_dir) as record:
         for _ in range(5):
             puncture(record, come_to_ready(record))
-        made = [make_output(record, output) for output in outputs_to_send(record)]
+        wanted = [*outputs_to_send(record), *plans_to_send(record)]
+        made = [make_output(record, output) for output in wanted]
         made.append(make_output(record, Output("measurement", 1, "report")))
         made.append(make_output(record, Output("measurement", 1, "presentation")))
     return [*sorted((case_dir / "inbox").iterdir()), *made]
@@ -82,6 +85,20 @@ def test_every_report_is_a_series_of_its_own_and_names_itself(objects):
     assert len({d.SeriesInstanceUID for d in reports}) == len(reports) == 11
     assert len({d.SeriesNumber for d in reports}) == len(reports)
     assert len({d.SeriesDescription for d in reports}) == len(reports)
+
+
+def test_our_plan_goes_back_as_it_was_decided_and_proposes_nothing_if_it_comes_again(objects):
+    path = next(p for p in objects if p.stem.startswith("plan-"))
+    case_dir = path.parents[1]
+    with CaseRecord(case_dir, read_only=True) as record:
+        event = record.events_of_kind("target_set")[0]
+        frame = record.last_slice("assigned").header["frame_of_reference_uid"]
+    assert plan_in(path, MAKER) is None
+    read = plan_in(path, "somebody else")
+    assert read is not None
+    (target,) = [point for point in read.points if point.label == "TARGET"]
+    assert target.patient_mm == pytest.approx(event.body["patient_mm"], abs=1e-6)
+    assert target.frame_of_reference_uid == frame
 
 
 def test_a_derived_image_keeps_what_its_sources_say_and_reads_the_same_without_a_rescale(objects):

@@ -139,7 +139,15 @@ def test_with_four_axes_each_fiducials_distance_is_shown_before_each_confirm(
         assert found.measurement is not None
         assert found.measurement.patient_mm is not None
         x, y, z = found.measurement.patient_mm
+        page.locator("#pick").click()
+        facts = page.locator("#pick-panel .facts")
+        expect(facts).to_contain_text("The needle's direction is not known")
         client.set_entry((x + 1.0, y - 40.0, z + 1.0))
+        for axis, place, said in (("y", y - 82.0, "Within"), ("x", x + 90.0, "Out of reach")):
+            page.locator(f"#pick-{axis}").fill(f"{place:.2f}")
+            page.locator(f"#pick-{axis}").press("Enter")
+            expect(facts).to_contain_text(said)
+        page.get_by_role("button", name="Cancel").click()
         client.set_target((x + 3.0, y - 82.0, z - 2.0))
         client.start_approach()
         shown = confirm_each(page, client)

@@ -43,13 +43,18 @@ def test_many_tabs_share_one_event_stream_and_a_stop_gets_out_of_any_of_them(
     browser: Browser, tmp_path: Path
 ) -> None:
     complaints = Complaints()
-    with running_service(tmp_path) as url, browser.new_context() as context:
+    camera = "http://bench.example:8090/"
+    with (
+        running_service(tmp_path, f'camera_preview_url = "{camera}"\n') as url,
+        browser.new_context() as context,
+    ):
         pages = [context.new_page() for _ in range(TABS)]
         for page in pages:
             complaints.watch(page)
             page.goto(url)
             expect(page.locator("#phases [aria-current]")).to_be_visible()
         assert viewers(url) == 1
+        expect(page.get_by_role("link", name="Camera")).to_have_attribute("href", camera)
         for number, page in enumerate((pages[0], pages[-1]), 1):
             page.bring_to_front()
             page.locator("#stop").click()

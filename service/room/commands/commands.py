@@ -61,6 +61,7 @@ def _all_of(
         robot.lock_motion,
         robot.needle_out,
         target.set_target,
+        target.reach,
         target.withdraw_target,
         target.choose_target,
         target.record_target,

@@ -59,7 +59,7 @@ class ProcedureCommands:
             arguments = calibration_of(self._room.config, self._room.travel(), self._room.seed())
         except PlanRefusedError as error:
             raise ConflictError("out_of_travel", f"Calibration: {error}.") from error
-        last, same_mount = last_jacobian(self._room.record, self._cases)
+        last, same_mount = last_jacobian(self._room.record, self._cases, CALIBRATION)
         arguments = replace(arguments, last=last, same_mount=same_mount)
         return self._room.begin(CALIBRATION, calibration_arguments(arguments), by)
 
@@ -68,6 +68,8 @@ class ProcedureCommands:
             arguments = guide_calibration_of(self._room.config, guide, self._room.travel())
         except PlanRefusedError as error:
             raise ConflictError("out_of_travel", f"Calibration: {error}.") from error
+        last, same_mount = last_jacobian(self._room.record, self._cases, GUIDE_CALIBRATION)
+        arguments = replace(arguments, last=last, same_mount=same_mount)
         return self._room.begin(GUIDE_CALIBRATION, guide_calibration_arguments(arguments), by)
 
     def start_approach(self, by: str, guide: bool | None = None) -> int:

@@ -63,6 +63,25 @@ class TargetCommands:
         except ReachUnknownError:
             pass  # an approach asks again before anything moves
 
+    def reach(
+        self, patient_mm: Sequence[float], by: str, in_water: bool = False
+    ) -> tuple[str, str]:
+        """Whether a point could be the target: `within`, `out` or `unknown`, and why.
+
+        Nothing is changed or recorded.
+        """
+        x, y, z = (float(value) for value in patient_mm)
+        plan = Plan(by, "target", "page", (x, y, z))
+        if why := why_senseless(plan) or why_not_in_bore(plan):
+            return "out", why
+        try:
+            check_reach(self._room, plan, in_water=in_water)
+        except OutOfReachError as error:
+            return "out", str(error)
+        except ReachUnknownError as error:
+            return "unknown", str(error)
+        return "within", ""
+
     def withdraw_target(self, by: str) -> None:
         """There is no target any more until another one is set."""
         if current_target(self._room.record) is None:

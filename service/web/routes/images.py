@@ -15,6 +15,7 @@ from service.room.images import (
     png_of,
     raw_of,
     reconstruction_pixels,
+    residual_pixels,
     slice_file,
     slice_pixels,
 )
@@ -104,6 +105,13 @@ def measurement_image_router() -> APIRouter:
         """The reconstruction as little-endian 32-bit floats; `X-Shape: rows,cols`."""
         pixels = pixels_of(measurement_id, case)
         return _raw(case, f"{case.folder} measurement {measurement_id}", pixels, match)
+
+    @router.get("/residual", response_class=Response, responses=_RAW)
+    def raw_residual(measurement_id: Id, case: OfCase, match: Match = None) -> Response:
+        """The newest slice less the fitted fiducial, floats as above; 0 far from the fiducial."""
+        with case.record() as record:
+            pixels = residual_pixels(record, measurement_id)
+        return _raw(case, f"{case.folder} residual {measurement_id}", pixels, match)
 
     return router
 

@@ -6,7 +6,15 @@ from fastapi import APIRouter
 
 from service.web.orders import REFUSALS, Caller, Key, Orders
 from service.web.pagination import Id
-from service.web.schemas import Ask, PointBody, Started, TargetBody, TargetHereBody
+from service.web.schemas import (
+    Ask,
+    PointBody,
+    ReachAsk,
+    ReachBody,
+    Started,
+    TargetBody,
+    TargetHereBody,
+)
 
 
 def target_router(orders: Orders) -> APIRouter:
@@ -17,6 +25,12 @@ def target_router(orders: Orders) -> APIRouter:
     def target(body: TargetBody, caller: Caller, key: Key = None) -> None:
         """Set where the fiducial is to be, patient mm (LPS)."""
         orders.carry_out(caller, key, "set_target", body)
+
+    @router.post("/target/reach")
+    def reach(body: ReachAsk, caller: Caller) -> ReachBody:
+        """Whether a point could be the target, by what an approach would work out now."""
+        verdict, text = orders.carry_out(caller, None, "reach", body)
+        return ReachBody(verdict=verdict, text=text)
 
     @router.post("/target/withdraw", status_code=204)
     def withdraw_target(body: Ask, caller: Caller, key: Key = None) -> None:
