@@ -23,6 +23,7 @@ from sr_engine.template.poses import learn_from_places
 Array = NDArray[np.float64]
 
 SAME_SLICE_MM = 0.5
+_CAMERA = "camera"
 _SAME_DIRECTION = 1e-3
 _SAME_SHARE = 1e-3
 _PROTOCOL = {
@@ -115,6 +116,9 @@ class Templates:
 def _learnt(views: Sequence[View], radius_px: tuple[float, float]) -> Learnt:
     if not views:
         raise TemplateError("no measurement is named that a template could be learnt from")
+    if any(row.header.get("kind") == _CAMERA for view in views for row in view.frames.slices):
+        # its pixels fold what is finer than they are: sigma would be too small (by a quarter)
+        raise TemplateError("images of a camera are not band-limited, as a template presumes")
     for view in views[1:]:
         if other := why_unlike(views[0].frames, view.frames):
             raise TemplateError(

@@ -211,11 +211,11 @@ def localize_as_asked(
     """The answer to a request, or what another method says of its frames."""
     method = method or request.method
     ids = request.request.get(TEMPLATE, ()) if method == TEMPLATE else ()
-    views = [_view(record, number) for number in ids]
+    views = [view_of(record, number) for number in ids]
     return localize_request(frames, method, request.request, psf, views, known.templates)
 
 
-def _view(record: CaseRecord, number: int) -> View:
+def view_of(record: CaseRecord, number: int) -> View:
     """An earlier measurement as a template is learnt from it: by the record, now and later."""
     row = record.measurement(number)
     if row.result is None:

@@ -19,6 +19,9 @@ from service.procedure.steering import why_never_sure
 from service.procedure.targets import Target, common_part_mm
 from simulator.config import CANNULATED, Fiducial, SliceProtocol, VirtualRoom
 from simulator.stage_physics import StageParameters
+from sr_engine.errors import TemplateError
+from sr_engine.views import Templates
+from sr_engine.worker import view_of
 from studies.offline_room import MrImaging, OfflineRoom
 from studies.recorded_room import RecordedRoom
 
@@ -118,6 +121,22 @@ def test_slices_of_another_protocol_are_not_fitted_by_it_and_said_to_be(recorded
     assert "calibrate again" in result["why_no_template"]
     # what disc and template mean by the middle may differ: that is in its covariance
     assert np.all(np.diag(seen.covariance_mm2) > np.square(start.found_by.systematic_mm))
+
+
+def test_a_cameras_images_make_no_template(recorded):
+    recorded.run_recorded(CALIBRATION, recorded_calibration(calibration_arguments()))
+    rows = recorded.record.measurements("done")
+    views = [view_of(recorded.record, row.measurement_id) for row in rows]
+    assert Templates().of(views, (2.5, 6.5)).template.n_frames == len(views)
+
+    def by_camera(view):
+        slices = tuple(
+            replace(s, header={**s.header, "kind": "camera"}) for s in view.frames.slices
+        )
+        return replace(view, frames=replace(view.frames, slices=slices))
+
+    with pytest.raises(TemplateError, match="camera"):
+        Templates().of([by_camera(view) for view in views], (2.5, 6.5))
 
 
 def test_another_thing_in_its_place_is_refused_by_name_with_what_to_do():
