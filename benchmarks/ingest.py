@@ -33,7 +33,7 @@ from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 from pynetdicom import AE
 
 from case_record.record import CaseRecord, CaseRecordError
-from dicom_listener.requestor import mended
+from dicom_listener.association_fix import mended
 from dicom_slice.quirks import MR_IMAGE
 
 ROOT = Path(__file__).parents[1]

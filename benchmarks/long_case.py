@@ -29,10 +29,10 @@ from service.cli.export import write_export
 from service.cli.report import report_page
 from service.client import RoomClient
 from service.room.cases.life import CaseLife
-from service.room.describe import Describer
 from service.room.execution import Execution
 from service.room.link import PumpedClient, RoomLink
 from service.room.state import RoomState
+from service.room.state_view import Describer
 from service.web.event_stream import _event_message
 from simulator.demo.room import DemoOptions
 

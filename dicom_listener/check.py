@@ -9,11 +9,11 @@ from pathlib import Path
 from pynetdicom import AE
 
 from case_record.cases import Cases
+from dicom_listener.association_fix import mended
 from dicom_listener.inbox import Envelope, Inbox, is_whole, sha256_of
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.negotiation import VERIFICATION
 from dicom_listener.process import PortError, inbox_folder, intake_rules, open_scp
-from dicom_listener.requestor import mended
 from room_config.load import Config
 
 _MIB = 2**20

@@ -42,10 +42,10 @@ from dicom_listener.slice_rows import (
     slice_from_record,
 )
 from dicom_slice.decode_guard import DecodeGuard
+from dicom_slice.eligibility import SliceRules, why_not_usable
 from dicom_slice.header import Slice, read_header
 from dicom_slice.reasons import Reason, SetAside, UnusableError
 from dicom_slice.times import TimeFrame
-from dicom_slice.usable import SliceRules, why_not_usable
 
 SOURCE = "listener"
 _HOLDS_LOOKED_AT = 64

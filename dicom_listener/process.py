@@ -27,7 +27,7 @@ from dicom_listener.network.drop_folder import DropFolder
 from dicom_listener.reception import Reception
 from dicom_listener.retention import remove_old
 from dicom_listener.scp import Scp, ScpRules, tls_context
-from dicom_slice.usable import SliceRules
+from dicom_slice.eligibility import SliceRules
 from room_config.listener import ListenerConfig
 from room_config.load import Config, ConfigError
 

@@ -37,7 +37,7 @@ from dicom_listener.network.commitment import Commitment
 from dicom_listener.network.endings import ending_of
 from dicom_listener.network.store_request import mend_store_request, uid_sent_under
 from dicom_listener.transport import BoundedSocket, PromptServer
-from dicom_slice.peek import NoDataSetError, peek
+from dicom_slice.preflight import NoDataSetError, peek
 from room_config.networks import address_of
 
 SUCCESS = 0x0000

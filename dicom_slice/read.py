@@ -6,10 +6,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dicom_slice.decode_guard import DecodeGuard
+from dicom_slice.eligibility import BY_HAND, SliceRules, why_not_usable
 from dicom_slice.header import Slice, read_header
 from dicom_slice.pixels import frame_pixels, read_with_pixels
 from dicom_slice.reasons import Reason, UnusableError
-from dicom_slice.usable import BY_HAND, SliceRules, why_not_usable
 
 # JPEG lossless, baseline and extended are decoded by GDCM
 _ABORTING = tuple(f"1.2.840.10008.1.2.4.{number}" for number in (50, 51, 57, 70))

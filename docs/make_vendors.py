@@ -10,10 +10,10 @@ import sys
 from collections import Counter, defaultdict
 from pathlib import Path
 
+from dicom_slice.eligibility import SliceRules, why_not_usable
 from dicom_slice.header import Slice, read_header
 from dicom_slice.pixels import check_pixels
 from dicom_slice.reasons import UnusableError
-from dicom_slice.usable import SliceRules, why_not_usable
 
 HERE = Path(__file__).parent
 _BESIDE = HERE.parents[1] / "shared" / "dicom"

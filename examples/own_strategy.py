@@ -7,15 +7,15 @@ import numpy as np
 
 from service.procedure.approach import ApproachArguments, approach
 from service.procedure.calibration import CalibrationArguments, calibrate
-from service.procedure.sensing import ValidationGate
-from service.procedure.strategies import STRATEGIES, Strategy, Way
+from service.procedure.observe import ValidationGate
+from service.procedure.strategies import STRATEGIES, Imaging, Strategy
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
 from sr_engine.reconstruction.shiftset import named
 from studies.offline_room import MrImaging, OfflineRoom
 
 # one native image while it is far, the paper's reconstruction near the target, moves remembered
-MINE = Strategy(coarse=Way("ml"), fine=Way("sr", shifted=True, factor=2), fuses=True)
+MINE = Strategy(coarse=Imaging("ml"), fine=Imaging("sr", shifted=True, factor=2), fuses=True)
 
 GATE = ValidationGate(3.0, gate_sigma=5.0, repeatability_mm=0.014, scale_error=0.015)
 AXES, TRAVEL_UM = ("xt", "yt"), (-20_000, 20_000)

@@ -19,7 +19,7 @@ from pynetdicom import AE
 from pynetdicom.association import Association
 from pynetdicom.sop_class import EnhancedMRImageStorage, MRImageStorage
 
-from dicom_listener.requestor import mended
+from dicom_listener.association_fix import mended
 
 _TRANSFER_SYNTAXES = [ExplicitVRLittleEndian, ImplicitVRLittleEndian]
 

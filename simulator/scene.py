@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.procedure.kinematics import Line
+from service.procedure.kinematics import NeedleLine
 from simulator.config import Fiducial, Placement, VirtualRoom
 
 Floats = NDArray[np.float64]
@@ -81,7 +81,7 @@ def true_fiducial_mm(room: VirtualRoom, stage_mm: Mapping[str, float]) -> Floats
     return true_fiducials_mm(room, stage_mm)[room.fiducials[0].name]
 
 
-def true_guide(room: VirtualRoom, stage_mm: Mapping[str, float]) -> Line:
+def true_guide(room: VirtualRoom, stage_mm: Mapping[str, float]) -> NeedleLine:
     """The guide's line in patient LPS mm, its point the lower ball joint, upwards.
 
     For rooms whose fiducials are on the guide: of the first two, the one further along is above.
@@ -91,5 +91,5 @@ def true_guide(room: VirtualRoom, stage_mm: Mapping[str, float]) -> Line:
         key=lambda one: -one.along_guide_mm,
     )[:2]
     places = true_fiducials_mm(room, stage_mm)
-    line = Line.through(places[below.name], places[above.name])
-    return Line(line.at(-below.along_guide_mm), line.direction)
+    line = NeedleLine.through(places[below.name], places[above.name])
+    return NeedleLine(line.at(-below.along_guide_mm), line.direction)

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 from service.procedure.approach import PAPER, PROBABILITY, ApproachArguments, Arrival, approach
 from service.procedure.calibration import Calibration, CalibrationArguments, calibrate
+from service.procedure.observe import ProcedureFailedError, ValidationGate, move
 from service.procedure.recording import RecordingArguments, record_place
-from service.procedure.sensing import ProcedureFailedError, ValidationGate, move
 from service.procedure.steps import MoveTo, ProcedureSteps
 from service.procedure.strategies import STRATEGIES
 from simulator.camera import Camera

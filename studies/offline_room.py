@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from case_record.rows import SliceRow
 from dicom_slice.geometry import SliceGeometry
 from robot_bridge.pmd.protocol import MICROSTEPS_PER_STEP
+from service.procedure.observe import ABORT
 from service.procedure.plan import PLAN_VOID, why_void
 from service.procedure.plane import ImagePlane
-from service.procedure.sensing import ABORT
 from service.procedure.steps import (
     Acquire,
     Acquired,

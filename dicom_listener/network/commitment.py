@@ -22,8 +22,8 @@ from pynetdicom.sop_class import (
     StorageCommitmentPushModelInstance,
 )
 
+from dicom_listener.association_fix import mended
 from dicom_listener.inbox import NotFromInboxError, is_whole, read_envelope
-from dicom_listener.requestor import mended
 
 REQUEST = 1
 _ALL_SAFE, _SOME_FAILED = 1, 2

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from dicom_slice.peek import NoDataSetError, Peeked, peek
+from dicom_slice.preflight import NoDataSetError, Peeked, peek
 
 _C_STORE_RQ = 0x0001
 _LONGEST_UID = 64

@@ -12,8 +12,8 @@ from collections.abc import Callable, Mapping, Sequence
 from robot_bridge.client.client_motion import OnState, refused, see_through
 from robot_bridge.client.client_values import (
     BridgeError,
+    BridgeIdentity,
     BridgeStatus,
-    Hello,
     IncompatibleError,
     LinkCounters,
     LinkLostError,
@@ -34,8 +34,8 @@ from robot_bridge.protocol.transport import SerialTransport, Transport
 __all__ = [
     "BridgeClient",
     "BridgeError",
+    "BridgeIdentity",
     "BridgeStatus",
-    "Hello",
     "IncompatibleError",
     "LinkCounters",
     "LinkLostError",
@@ -80,7 +80,7 @@ class BridgeClient:
 
     # --- session ------------------------------------------------------------------------------
 
-    def open(self, timeout_s: float = 5.0) -> Hello:
+    def open(self, timeout_s: float = 5.0) -> BridgeIdentity:
         """Open the port and a session (again). Raises LinkLostError or IncompatibleError.
 
         A session begins disarmed. Opening one ends any other and stops its motion.

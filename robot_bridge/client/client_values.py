@@ -35,7 +35,7 @@ class RefusedError(BridgeError):
 
 
 @dataclass(frozen=True)
-class Hello:
+class BridgeIdentity:
     """What the bridge said of itself when the session was opened."""
 
     axes: tuple[AxisTravel, ...]
@@ -115,8 +115,8 @@ class LinkCounters:
     round_trip_s: float | None
 
 
-def hello_of(hello: messages.Hello, changed: bool) -> Hello:
-    return Hello(**_shared(hello, Hello), boot_id_changed=changed)
+def hello_of(hello: messages.Hello, changed: bool) -> BridgeIdentity:
+    return BridgeIdentity(**_shared(hello, BridgeIdentity), boot_id_changed=changed)
 
 
 def status_of(status: messages.Status, age_s: float) -> BridgeStatus:

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import NoReturn
 
 from robot_bridge.client.client_values import (
+    BridgeIdentity,
     BridgeStatus,
-    Hello,
     IncompatibleError,
     LinkCounters,
     LinkLostError,
@@ -78,7 +78,7 @@ class Session:
 
     # --- opening ------------------------------------------------------------------------------
 
-    def open(self, timeout_s: float) -> Hello:
+    def open(self, timeout_s: float) -> BridgeIdentity:
         """Raises LinkLostError or IncompatibleError."""
         until_s = self._clock() + timeout_s
         boot_before = self._hello.boot_id if self._hello else None

@@ -13,6 +13,7 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from robot_bridge.daemon import rules
+from robot_bridge.daemon.arming import Arming
 from robot_bridge.daemon.bridge_journal import BridgeJournal
 from robot_bridge.daemon.bridge_settings import BridgeSettings
 from robot_bridge.daemon.bridge_view import BridgeView
@@ -21,7 +22,6 @@ from robot_bridge.daemon.motion import Ending
 from robot_bridge.daemon.motion_in_flight import MotionInFlight
 from robot_bridge.daemon.motor_watch import MotorWatch
 from robot_bridge.daemon.motors import Motors
-from robot_bridge.daemon.permission import Permission
 from robot_bridge.daemon.requests import Requests
 from robot_bridge.daemon.whereabouts import Whereabouts
 from robot_bridge.protocol.bridge_end import (
@@ -61,7 +61,7 @@ class Bridge:
         self._booted_s = self._fresh_s = self._ticked_s = clock()
         self._last_stop_nonce: int | None = None
         self._journal = BridgeJournal(journal, wall_clock, self.refused)
-        self._permission = Permission(journal.stop)
+        self._permission = Arming(journal.stop)
         self._motion = MotionInFlight(
             self.motors, self._journal, clock,
             boot_id=boot_id, timeout_s=settings.motion_timeout_s,

@@ -5,11 +5,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 from robot_bridge.daemon import rules
+from robot_bridge.daemon.arming import Arming
 from robot_bridge.daemon.bridge_journal import BridgeJournal
 from robot_bridge.daemon.bridge_settings import BridgeSettings
 from robot_bridge.daemon.motion_in_flight import MotionInFlight
 from robot_bridge.daemon.motor_watch import MotorWatch
-from robot_bridge.daemon.permission import Permission
 from robot_bridge.daemon.whereabouts import Stand
 from robot_bridge.protocol.framing import FrameCounters
 from robot_bridge.protocol.messages import (
@@ -26,7 +26,7 @@ from robot_bridge.protocol.packing import SCHEMA
 class BridgeView:
     settings: BridgeSettings
     boot_id: str
-    permission: Permission
+    permission: Arming
     motion: MotionInFlight
     motors: MotorWatch
     journal: BridgeJournal
@@ -38,10 +38,10 @@ class BridgeView:
     def stale_after_ms(self) -> int:
         return round(self.settings.deadman_s * 1000)
 
-    def standing(self, request: Message) -> rules.Standing:
+    def standing(self, request: Message) -> rules.BridgeFacts:
         permission = self.permission
         command = self.motion.command
-        return rules.Standing(
+        return rules.BridgeFacts(
             phase=permission.phase,
             armed=permission.armed,
             stopped=permission.stopped,

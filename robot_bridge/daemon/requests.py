@@ -9,6 +9,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 from robot_bridge.daemon import rules
+from robot_bridge.daemon.arming import Arming
 from robot_bridge.daemon.bridge_journal import BridgeJournal
 from robot_bridge.daemon.bridge_view import BridgeView
 from robot_bridge.daemon.journal import CommandRecord, JournalError
@@ -16,7 +17,6 @@ from robot_bridge.daemon.motion import Ending
 from robot_bridge.daemon.motion_in_flight import MotionInFlight
 from robot_bridge.daemon.motor_watch import MotorWatch
 from robot_bridge.daemon.motors import MotorError
-from robot_bridge.daemon.permission import Permission
 from robot_bridge.protocol.messages import (
     TEXT_MAX,
     Answer,
@@ -42,7 +42,7 @@ class Requests:
     """`refused` counts refusals by their code."""
 
     view: BridgeView
-    permission: Permission
+    permission: Arming
     motion: MotionInFlight
     motors: MotorWatch
     journal: BridgeJournal

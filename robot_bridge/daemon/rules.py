@@ -30,7 +30,7 @@ from robot_bridge.protocol.phases import ALLOWED, WorkPhase, may_follow
 
 
 @dataclass(frozen=True)
-class Standing:
+class BridgeFacts:
     """How the bridge stands when a request arrives; all that the rules look at."""
 
     phase: WorkPhase
@@ -54,7 +54,7 @@ class Standing:
 Refusal = tuple[Code, str]
 
 
-def refusal(standing: Standing, request: Message) -> Refusal | None:
+def refusal(standing: BridgeFacts, request: Message) -> Refusal | None:
     """The rule that `request` breaks and a text that names it, or None if it may be done."""
     for rule in _RULES[type(request)]:
         broken = rule(standing, request)
@@ -68,7 +68,7 @@ def is_fresh(now_ms: int, seen_ms: int, stale_after_ms: int) -> bool:
     return 0 <= now_ms - seen_ms <= stale_after_ms
 
 
-def _stale(standing: Standing, request: Message) -> Refusal | None:
+def _stale(standing: BridgeFacts, request: Message) -> Refusal | None:
     seen_ms = getattr(request, "seen_ms")  # noqa: B009
     if is_fresh(standing.now_ms, seen_ms, standing.stale_after_ms):
         return None
@@ -78,27 +78,27 @@ def _stale(standing: Standing, request: Message) -> Refusal | None:
     )
 
 
-def _stale_unlock(standing: Standing, request: Message) -> Refusal | None:
+def _stale_unlock(standing: BridgeFacts, request: Message) -> Refusal | None:
     # Locking is the safe direction and is never too late.
     assert isinstance(request, SetInsertionLock)
     return None if request.locked else _stale(standing, request)
 
 
-def _nobody(standing: Standing, request: Message) -> Refusal | None:
+def _nobody(standing: BridgeFacts, request: Message) -> Refusal | None:
     by = getattr(request, "by")  # noqa: B009
     if len(by.strip()) > 0 and len(by) <= NAME_MAX:
         return None
     return Code.NO_OPERATOR, f"the request names no operator (1 to {NAME_MAX} characters)"
 
 
-def _nameless(standing: Standing, request: Message) -> Refusal | None:
+def _nameless(standing: BridgeFacts, request: Message) -> Refusal | None:
     assert isinstance(request, Move | Home)
     if 0 < len(request.command_id) <= NAME_MAX:
         return None
     return Code.MALFORMED, f"the command id must have 1 to {NAME_MAX} characters"
 
 
-def _stop_latched(standing: Standing, request: Message) -> Refusal | None:
+def _stop_latched(standing: BridgeFacts, request: Message) -> Refusal | None:
     if not standing.stopped:
         return None
     return Code.STOP_LATCHED, (
@@ -106,11 +106,11 @@ def _stop_latched(standing: Standing, request: Message) -> Refusal | None:
     )
 
 
-def _no_stop(standing: Standing, request: Message) -> Refusal | None:
+def _no_stop(standing: BridgeFacts, request: Message) -> Refusal | None:
     return None if standing.stopped else (Code.NOT_STOPPED, "no stop is latched")
 
 
-def _wrong_stop(standing: Standing, request: Message) -> Refusal | None:
+def _wrong_stop(standing: BridgeFacts, request: Message) -> Refusal | None:
     assert isinstance(request, Arm | Rearm)
     if request.stop_count == standing.stop_count:
         return None
@@ -120,41 +120,41 @@ def _wrong_stop(standing: Standing, request: Message) -> Refusal | None:
     )
 
 
-def _faulty(standing: Standing, request: Message) -> Refusal | None:
+def _faulty(standing: BridgeFacts, request: Message) -> Refusal | None:
     if standing.fault is None:
         return None
     return Code.MOTOR_FAULT, f"the motors report {standing.fault}"
 
 
-def _not_armed(standing: Standing, request: Message) -> Refusal | None:
+def _not_armed(standing: BridgeFacts, request: Message) -> Refusal | None:
     return None if standing.armed else (Code.NOT_ARMED, "the bridge is not armed")
 
 
-def _locked(standing: Standing, request: Message) -> Refusal | None:
+def _locked(standing: BridgeFacts, request: Message) -> Refusal | None:
     if not standing.insertion_locked:
         return None
     return Code.INSERTION_LOCKED, "the insertion lock is set: the needle may be in"
 
 
-def _in_flight(standing: Standing, request: Message) -> Refusal | None:
+def _in_flight(standing: BridgeFacts, request: Message) -> Refusal | None:
     if standing.in_flight is None:
         return None
     return Code.MOTION_IN_FLIGHT, f"command {standing.in_flight!r} is still running"
 
 
-def _phase_forbids_move(standing: Standing, request: Message) -> Refusal | None:
+def _phase_forbids_move(standing: BridgeFacts, request: Message) -> Refusal | None:
     if ALLOWED[standing.phase].move:
         return None
     return Code.WRONG_PHASE, f"motion is not allowed in phase {standing.phase}"
 
 
-def _phase_forbids_home(standing: Standing, request: Message) -> Refusal | None:
+def _phase_forbids_home(standing: BridgeFacts, request: Message) -> Refusal | None:
     if ALLOWED[standing.phase].home:
         return None
     return Code.WRONG_PHASE, f"homing is not allowed in phase {standing.phase}"
 
 
-def _phase_not_reachable(standing: Standing, request: Message) -> Refusal | None:
+def _phase_not_reachable(standing: BridgeFacts, request: Message) -> Refusal | None:
     assert isinstance(request, SetPhase)
     if request.phase not in WorkPhase.__members__:
         return Code.MALFORMED, f"{request.phase[:40]!r} is not a work phase"
@@ -163,12 +163,12 @@ def _phase_not_reachable(standing: Standing, request: Message) -> Refusal | None
     return Code.PHASE_NOT_ALLOWED, f"{request.phase} may not follow {standing.phase}"
 
 
-def _beyond_travel(standing: Standing, request: Message) -> Refusal | None:
+def _beyond_travel(standing: BridgeFacts, request: Message) -> Refusal | None:
     assert isinstance(request, Move)
     return check_setpoints(request.setpoints_um, standing.axes, standing.readback_um)
 
 
-def _declared_beyond_travel(standing: Standing, request: Message) -> Refusal | None:
+def _declared_beyond_travel(standing: BridgeFacts, request: Message) -> Refusal | None:
     assert isinstance(request, DeclarePosition)
     named = [axis for axis in standing.axes if axis.name in request.positions_um]
     if not named and not request.positions_um:
@@ -176,7 +176,7 @@ def _declared_beyond_travel(standing: Standing, request: Message) -> Refusal | N
     return check_setpoints(request.positions_um, named) or _bad_bounds(request.within_um, standing)
 
 
-def _bad_bounds(within_um: Mapping[str, int], standing: Standing) -> Refusal | None:
+def _bad_bounds(within_um: Mapping[str, int], standing: BridgeFacts) -> Refusal | None:
     known = {axis.name for axis in standing.axes}
     for axis, bound_um in within_um.items():
         if axis not in known:
@@ -186,7 +186,7 @@ def _bad_bounds(within_um: Mapping[str, int], standing: Standing) -> Refusal | N
     return None
 
 
-def _bad_correction(standing: Standing, request: Message) -> Refusal | None:
+def _bad_correction(standing: BridgeFacts, request: Message) -> Refusal | None:
     assert isinstance(request, CorrectPosition)
     if request.correction_um.keys() != request.within_um.keys() or not request.correction_um:
         return Code.MALFORMED, "every correction needs its own bound, and there must be no others"
@@ -195,7 +195,7 @@ def _bad_correction(standing: Standing, request: Message) -> Refusal | None:
     return _bad_bounds(request.within_um, standing)
 
 
-def _drives_held_off(standing: Standing, request: Message) -> Refusal | None:
+def _drives_held_off(standing: BridgeFacts, request: Message) -> Refusal | None:
     # Power on may shift an axis a little; off is the safe direction.
     assert isinstance(request, SetDrives)
     if not request.on:
@@ -203,7 +203,7 @@ def _drives_held_off(standing: Standing, request: Message) -> Refusal | None:
     return _stop_latched(standing, request) or _locked(standing, request)
 
 
-def _no_such_axis(standing: Standing, request: Message) -> Refusal | None:
+def _no_such_axis(standing: BridgeFacts, request: Message) -> Refusal | None:
     assert isinstance(request, Home)
     known = {axis.name for axis in standing.axes}
     for axis in request.axes:
@@ -212,7 +212,7 @@ def _no_such_axis(standing: Standing, request: Message) -> Refusal | None:
     return None
 
 
-def _moved_axes(standing: Standing, request: Move) -> list[AxisTravel]:
+def _moved_axes(standing: BridgeFacts, request: Move) -> list[AxisTravel]:
     """Those that do not stand already where they are asked to be."""
     return [
         axis
@@ -222,7 +222,7 @@ def _moved_axes(standing: Standing, request: Move) -> list[AxisTravel]:
     ]
 
 
-def _uncertain(standing: Standing, request: Message) -> Refusal | None:
+def _uncertain(standing: BridgeFacts, request: Message) -> Refusal | None:
     assert isinstance(request, Move)
     for axis in _moved_axes(standing, request):
         if axis.name not in standing.certain_axes:
@@ -232,7 +232,7 @@ def _uncertain(standing: Standing, request: Message) -> Refusal | None:
     return None
 
 
-def _too_little_known(standing: Standing, request: Message) -> Refusal | None:
+def _too_little_known(standing: BridgeFacts, request: Message) -> Refusal | None:
     assert isinstance(request, Move)
     for axis in _moved_axes(standing, request):
         setpoint_um = request.setpoints_um[axis.name]
@@ -246,7 +246,7 @@ def _too_little_known(standing: Standing, request: Message) -> Refusal | None:
     return None
 
 
-def _outdated(standing: Standing, request: Message) -> Refusal | None:
+def _outdated(standing: BridgeFacts, request: Message) -> Refusal | None:
     assert isinstance(request, Move)
     if request.based_on_motion != standing.last_motion:
         return Code.OUTDATED_MEASUREMENT, (
@@ -261,7 +261,7 @@ def _outdated(standing: Standing, request: Message) -> Refusal | None:
     return None
 
 
-Rule = Callable[[Standing, Any], Refusal | None]
+Rule = Callable[[BridgeFacts, Any], Refusal | None]
 
 _MAY_MOVE: tuple[Rule, ...] = (
     _nameless,

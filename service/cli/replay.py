@@ -21,9 +21,9 @@ from case_record.rows import Measurement, Procedure
 from dicom_slice.reasons import UnusableError
 from room_config.exit_codes import BAD_INPUT, COULD_NOT
 from service.procedure.estimate import axis_sigma
+from service.procedure.observe import ProcedureFailedError
 from service.procedure.registry import build_procedure
 from service.procedure.runner import ReplayMismatchError, same_step
-from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steps import outcome_from_json
 from sr_engine.errors import EngineError
 from sr_engine.request import UnusableSlicesError, describe_result, recorded_point_spread

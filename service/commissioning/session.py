@@ -17,11 +17,11 @@ from typing import Any
 from dicom_listener.inbox import Inbox, read_envelope
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.process import intake_rules, open_scp
+from dicom_slice.eligibility import why_not_usable
 from dicom_slice.header import read_header
 from dicom_slice.pixels import magnitude_pixels
 from dicom_slice.reasons import UnusableError
 from dicom_slice.times import TimeFrame
-from dicom_slice.usable import why_not_usable
 from room_config.load import Config
 from service.commissioning.evidence import Press, Reception, ScannedSeries, one_series
 

@@ -8,7 +8,7 @@ from importlib.metadata import version
 from pydicom.dataset import Dataset
 from pydicom.uid import UID, generate_uid
 
-from service.dicom_out.finding import Finding
+from service.dicom_out.content import ReportContent
 
 MAKER = "AutoSPINe Navigator"
 RESEARCH = "Research software, not a medical device. Not for diagnosis."
@@ -20,18 +20,18 @@ def software_version() -> str:
     return version("autospine")
 
 
-def output_uid(finding: Finding, *words: str) -> UID:
+def output_uid(finding: ReportContent, *words: str) -> UID:
     """The same for the same words in the same case, everywhere and always."""
     return generate_uid(entropy_srcs=[finding.case_uid, *words])
 
 
-def series_uid(finding: Finding, kind: str, dataset: Dataset, *words: str) -> UID:
+def series_uid(finding: ReportContent, kind: str, dataset: Dataset, *words: str) -> UID:
     """One series a kind, study, frame of reference, and whatever else is the series'."""
     study, frame = str(dataset.StudyInstanceUID), str(dataset.get("FrameOfReferenceUID", ""))
     return output_uid(finding, "series", kind, study, frame, software_version(), *words)
 
 
-def subject_of(finding: Finding) -> tuple[str, int]:
+def subject_of(finding: ReportContent) -> tuple[str, int]:
     """What it is about: a puncture, a READY, or a measurement, and its number."""
     if finding.puncture is not None:
         return "puncture", finding.puncture.event_id
@@ -40,7 +40,7 @@ def subject_of(finding: Finding) -> tuple[str, int]:
     return "measurement", finding.measurement.measurement_id
 
 
-def instant_s(finding: Finding) -> float:
+def instant_s(finding: ReportContent) -> float:
     """When what it is about happened, wall clock."""
     if finding.puncture is not None:
         return finding.puncture.wall_s
@@ -49,7 +49,7 @@ def instant_s(finding: Finding) -> float:
     return finding.measurement.finished_s or finding.measurement.requested_s
 
 
-def stamp(dataset: Dataset, finding: Finding, kind: str, description: str) -> None:
+def stamp(dataset: Dataset, finding: ReportContent, kind: str, description: str) -> None:
     """Instants, series and equipment; whatever the clock said while the object was made.
 
     A report is a series of its own, with its own instant and description (which is what archives

@@ -5,9 +5,9 @@ from __future__ import annotations
 from pydicom.dataset import Dataset
 
 from dicom_slice.geometry import SliceGeometry
+from service.dicom_out.content import ReportContent
 from service.dicom_out.derived import SERIES_SHARED, derived_image
 from service.dicom_out.errors import OutputError
-from service.dicom_out.finding import Finding
 from service.dicom_out.identity import output_uid, series_uid, stamp
 from service.dicom_out.source import tidy_patient
 from service.room.images import load_reconstruction
@@ -16,11 +16,11 @@ from sr_engine.reconstruction.reconstruct import Reconstruction
 from sr_engine.reconstruction.shiftset import condition_number, noise_factor
 
 
-def has_image(finding: Finding) -> bool:
+def has_image(finding: ReportContent) -> bool:
     return bool(finding.result.get("reconstruction"))
 
 
-def image_of(finding: Finding) -> Dataset:
+def image_of(finding: ReportContent) -> Dataset:
     """The derived MR image; raises OutputError where the measurement has no reconstruction."""
     number = finding.measurement.measurement_id
     if not has_image(finding):
@@ -39,12 +39,12 @@ def image_of(finding: Finding) -> Dataset:
     return dataset
 
 
-def fine_geometry(finding: Finding, factor: int) -> SliceGeometry:
+def fine_geometry(finding: ReportContent, factor: int) -> SliceGeometry:
     """Of the reconstruction: it covers what its slices cover."""
     return finding.geometry.finer_grid(factor)
 
 
-def _reconstruction(finding: Finding) -> Reconstruction:
+def _reconstruction(finding: ReportContent) -> Reconstruction:
     """As the worker made it, from the image and the shifts that the record keeps."""
     image = load_reconstruction(finding.case_dir, finding.result)
     shape = finding.geometry.shape

@@ -25,7 +25,7 @@ from service.dicom_out.errors import OutputError
 if TYPE_CHECKING:
     from pydicom.dataset import Dataset
 
-from service.dicom_out.finding import Finding, arrivals_said_ready, plan_events
+from service.dicom_out.content import ReportContent, arrivals_said_ready, plan_events
 
 FOLDER = "outputs"
 Kind = Literal["image", "report", "presentation", "plan"]
@@ -124,7 +124,7 @@ def _dataset(record: CaseRecord, output: Output) -> Dataset:
     return dataset_of(_finding(record, output), output)
 
 
-def dataset_of(finding: Finding, output: Output) -> Dataset:
+def dataset_of(finding: ReportContent, output: Output) -> Dataset:
     """The DICOM object of an output; the same for the same record."""
     from service.dicom_out.image import image_of
 
@@ -139,8 +139,8 @@ def dataset_of(finding: Finding, output: Output) -> Dataset:
     return report_of(finding)
 
 
-def _finding(record: CaseRecord, output: Output) -> Finding:
-    from service.dicom_out.finding import (
+def _finding(record: CaseRecord, output: Output) -> ReportContent:
+    from service.dicom_out.content import (
         finding_of_arrival,
         finding_of_measurement,
         finding_of_puncture,

@@ -20,7 +20,7 @@ from pynetdicom.sop_class import (
     MRImageStorage,
 )
 
-from dicom_listener.requestor import mended
+from dicom_listener.association_fix import mended
 from room_config.outputs import Destination
 
 _SOP_CLASSES = (

@@ -69,7 +69,7 @@ class Delivery:
 
 
 @dataclass(frozen=True)
-class Line:
+class DestinationLine:
     """How a destination does; failing_since_s None: it answers, or was not tried yet."""
 
     name: str
@@ -205,9 +205,9 @@ class OutboxStore:
         )
         return {(row["destination"], row["state"]): int(row["n"]) for row in rows}
 
-    def lines(self) -> dict[str, Line]:
+    def lines(self) -> dict[str, DestinationLine]:
         rows = self._db.execute("SELECT * FROM destination")
-        return {row["name"]: Line(**row) for row in rows}
+        return {row["name"]: DestinationLine(**row) for row in rows}
 
 
 def cases_with_open_deliveries(cases: Cases) -> list[Path]:

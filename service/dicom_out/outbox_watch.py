@@ -22,7 +22,7 @@ from room_config.load import Config
 from service.dicom_out.outbox_store import (
     PRESENCE,
     STATES,
-    Line,
+    DestinationLine,
     OutboxStore,
     cases_with_open_deliveries,
 )
@@ -48,7 +48,7 @@ class OutboxWatch(Collector):
         self._thread = threading.Thread(target=self._run, name="outbox", daemon=True)
         self._conditions: tuple[Condition, ...] = ()
         self._folders: set[Path] = set()
-        self._lines: dict[str, Line] = {}
+        self._lines: dict[str, DestinationLine] = {}
         self._counts: dict[tuple[str, str], int] = {}
 
     def start(self) -> None:
@@ -105,7 +105,7 @@ class OutboxWatch(Collector):
 
     def _look(self) -> None:
         """At the open case, and at those before it of which something is still to be sent."""
-        lines: dict[str, Line] = {}
+        lines: dict[str, DestinationLine] = {}
         counts: Counter[tuple[str, str]] = Counter()
         now = self._cases.open
         for folder in {*self._folders, now} - {None}:

@@ -18,8 +18,8 @@ from pydicom.valuerep import format_number_as_ds
 from case_record.record import CaseRecord
 from case_record.rows import Event, SliceRow
 from dicom_slice.plan import ENTRY, SPATIAL_FIDUCIALS, TARGET
+from service.dicom_out.content import plan_events
 from service.dicom_out.errors import OutputError
-from service.dicom_out.finding import plan_events
 from service.dicom_out.identity import MAKER, SERIES_NUMBERS, software_version
 from service.dicom_out.source import frame_of_reference, tidy_patient
 from service.procedure.targets import ENTRY_SET, TARGET_SET, TARGET_WITHDRAWN

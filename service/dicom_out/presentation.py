@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from pydicom.dataset import Dataset
 from pydicom.uid import ExplicitVRLittleEndian
 
-from service.dicom_out.finding import Finding
+from service.dicom_out.content import ReportContent
 from service.dicom_out.identity import (
     MAKER,
     RESEARCH,
@@ -67,7 +67,7 @@ class Drawing:
         return bool(np.all(inside))
 
 
-def presentation_of(finding: Finding) -> Dataset:
+def presentation_of(finding: ReportContent) -> Dataset:
     """The presentation state; the same for the same record."""
     drawing = _drawing(finding)
     subject, number = subject_of(finding)
@@ -101,7 +101,7 @@ def presentation_of(finding: Finding) -> Dataset:
     return made
 
 
-def _drawing(finding: Finding) -> Drawing:
+def _drawing(finding: ReportContent) -> Drawing:
     displacement_mm = finding.displacement_mm
     if has_image(finding):
         image, frame = image_of(finding), None
@@ -124,7 +124,7 @@ def _drawing(finding: Finding) -> Drawing:
     )
 
 
-def _annotations(finding: Finding, drawing: Drawing) -> Iterator[GraphicAnnotation]:
+def _annotations(finding: ReportContent, drawing: Drawing) -> Iterator[GraphicAnnotation]:
     centre_px, radius_px, target_px = drawing.centre_px, drawing.radius_px, drawing.target_px
     arm = np.array([_CROSS * radius_px, 0.0])
     cross = [_line(centre_px - turn, centre_px + turn) for turn in (arm, arm[::-1])]
@@ -170,7 +170,7 @@ def _arrow(from_px: NDArray[np.float64], to_px: NDArray[np.float64]) -> Iterator
     yield _line(to_px + back + side, to_px, to_px + back - side)
 
 
-def _words(finding: Finding, drawing: Drawing) -> str:
+def _words(finding: ReportContent, drawing: Drawing) -> str:
     place = " ".join(f"{value:.3f}" for value in finding.result["patient_mm"])
     sigma_um = 1000 * axis_sigma(finding.result["covariance_mm2"])
     lines = [RESEARCH, f"Fiducial at {place} mm (LPS), standard deviation {sigma_um:.0f} um"]

@@ -30,7 +30,7 @@ from pydicom.sequence import Sequence as DicomSequence
 from pydicom.sr.codedict import codes
 
 from service.dicom_out import codes as concept
-from service.dicom_out.finding import Distance, Finding
+from service.dicom_out.content import Distance, ReportContent
 from service.dicom_out.identity import (
     MAKER,
     RESEARCH,
@@ -47,7 +47,7 @@ from service.dicom_out.source import frame_of_reference, source_of
 _DIGITS = 6
 
 
-def report_of(finding: Finding) -> Dataset:
+def report_of(finding: ReportContent) -> Dataset:
     """The report; the same for the same record."""
     evidence = [source_of(finding, index) for index in range(len(finding.files))]
     if has_image(finding):
@@ -73,7 +73,7 @@ def report_of(finding: Finding) -> Dataset:
     return made
 
 
-def _content(finding: Finding, evidence: list[Dataset], place: str) -> MeasurementReport:
+def _content(finding: ReportContent, evidence: list[Dataset], place: str) -> MeasurementReport:
     """place: UID of the frame of reference."""
     device = DeviceObserverIdentifyingAttributes(
         uid=output_uid(finding, "device"),
@@ -94,7 +94,7 @@ def _content(finding: Finding, evidence: list[Dataset], place: str) -> Measureme
 
 
 def _group(
-    finding: Finding, evidence: list[Dataset], place: str
+    finding: ReportContent, evidence: list[Dataset], place: str
 ) -> MeasurementsAndQualitativeEvaluations:
     subject, number = subject_of(finding)
     group = MeasurementsAndQualitativeEvaluations(
@@ -122,7 +122,7 @@ def _group(
     return group
 
 
-def _centre(finding: Finding, place: str) -> Iterator[Measurement]:
+def _centre(finding: ReportContent, place: str) -> Iterator[Measurement]:
     centre_mm = np.array(finding.result["patient_mm"], dtype=float)
     point = CoordinatesForMeasurement3D("POINT", centre_mm[None, :], place)
     for name, value in zip(concept.CENTRE, centre_mm, strict=True):
@@ -136,7 +136,7 @@ def _centre(finding: Finding, place: str) -> Iterator[Measurement]:
     )
 
 
-def _circle(finding: Finding) -> np.ndarray:
+def _circle(finding: ReportContent) -> np.ndarray:
     """(4, 3): ends of two diameters, patient mm."""
     geometry = finding.geometry
     along, down = np.array(geometry.col_direction), np.array(geometry.row_direction)
@@ -144,13 +144,13 @@ def _circle(finding: Finding) -> np.ndarray:
     return np.asarray(np.array(finding.result["patient_mm"]) + arms)
 
 
-def _quality(finding: Finding) -> Iterator[Measurement]:
+def _quality(finding: ReportContent) -> Iterator[Measurement]:
     yield _number(concept.FRAMES, finding.result["n_frames"], concept.SLICES)
     yield _number(concept.SNR, finding.result["snr"], concept.NO_UNIT)
     yield _number(concept.CHI_SQUARED, finding.result["chi2_per_dof"], concept.NO_UNIT)
 
 
-def _target(finding: Finding) -> Iterator[Measurement]:
+def _target(finding: ReportContent) -> Iterator[Measurement]:
     """What is known of the target: how far it is, how sure that is, how deep the needle went."""
     displacement_mm = finding.displacement_mm
     if displacement_mm is not None:
@@ -181,7 +181,7 @@ def _number(name: CodedConcept, value: float, unit: CodedConcept, **more: Any) -
     return Measurement(name=name, value=round(float(value), _DIGITS), unit=unit, **more)
 
 
-def comment_of(finding: Finding) -> str:
+def comment_of(finding: ReportContent) -> str:
     """What it is about, in words."""
     subject, number = subject_of(finding)
     about = {

@@ -15,8 +15,8 @@ from pydicom.sequence import Sequence as DicomSequence
 from pydicom.valuerep import format_number_as_ds
 
 from dicom_slice.geometry import SliceGeometry
+from service.dicom_out.content import ReportContent
 from service.dicom_out.errors import OutputError
-from service.dicom_out.finding import Finding
 
 _EMPTY_IF_MISSING = (
     "PatientName",
@@ -34,7 +34,7 @@ _SHARED, _EACH = "SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequ
 _RESCALE = "PixelValueTransformationSequence"
 
 
-def source_of(finding: Finding, index: int) -> Dataset:
+def source_of(finding: ReportContent, index: int) -> Dataset:
     """Header of a slice, without pixels; of a multi-frame image as if all frames were that one."""
     dataset = pydicom.dcmread(finding.files[index], stop_before_pixels=True)
     _needs(dataset, "StudyInstanceUID", "SeriesInstanceUID")

@@ -21,9 +21,9 @@ from service.procedure.steering import Standing, SteeringArguments, frames_that_
 from service.procedure.steps import ProcedureSteps
 from service.procedure.strategies import (
     STRATEGIES,
-    Look,
+    Imaging,
+    Observation,
     Strategy,
-    Way,
     look_at_fiducial,
     look_longer,
 )
@@ -84,12 +84,14 @@ class SteeredFiducial:
         return chosen if isinstance(chosen, Strategy) else STRATEGIES[chosen]
 
     def look(
-        self, calibration: Calibration, way: Way, *, number: int, fresh: bool
-    ) -> ProcedureSteps[Look]:
+        self, calibration: Calibration, way: Imaging, *, number: int, fresh: bool
+    ) -> ProcedureSteps[Observation]:
         seed = (self.arguments.seed, number)
         return look_at_fiducial(way, calibration, self.arguments.gate, seed=seed, fresh=fresh)
 
-    def look_longer(self, seen: Look, estimate: FiducialEstimate) -> ProcedureSteps[Look | None]:
+    def look_longer(
+        self, seen: Observation, estimate: FiducialEstimate
+    ) -> ProcedureSteps[Observation | None]:
         wanted = self.frames_wanted(estimate, seen.frames)
         if seen.acquired is None or wanted <= seen.frames:
             return None
@@ -121,7 +123,7 @@ class SteeredFiducial:
     def is_sure(self, estimate: FiducialEstimate) -> bool:
         return self.probability(estimate) >= self.arguments.confidence
 
-    def is_there(self, calibration: Calibration, way: Way) -> bool:
+    def is_there(self, calibration: Calibration, way: Imaging) -> bool:
         if self.arguments.stop_rule == PROBABILITY:
             return self.is_sure(calibration.estimate)
         pixel_mm = np.array(calibration.plane.spacing_mm) / way.factor
@@ -134,7 +136,7 @@ class SteeredFiducial:
         )
 
 
-def _arrival(fiducial: SteeredFiducial, standing: Standing[Look]) -> Arrival:
+def _arrival(fiducial: SteeredFiducial, standing: Standing[Observation]) -> Arrival:
     estimate = standing.calibration.estimate
     return Arrival(
         standing.calibration,

@@ -17,8 +17,7 @@ from scipy.linalg import block_diag
 
 from service.procedure.estimate import FiducialEstimate, MotionNoise
 from service.procedure.jacobian import CalibrationError, ImageJacobian
-from service.procedure.plane import ImagePlane
-from service.procedure.sensing import (
+from service.procedure.observe import (
     ML,
     TEMPLATE,
     Expectation,
@@ -31,6 +30,7 @@ from service.procedure.sensing import (
     measure_step,
     move,
 )
+from service.procedure.plane import ImagePlane
 from service.procedure.steps import HoldShift, Measured, MoveTo, ProcedureSteps, ask
 
 DISC = "disc"

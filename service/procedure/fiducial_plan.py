@@ -11,9 +11,9 @@ from room_config.load import Config
 from service.procedure.approach import ApproachArguments
 from service.procedure.calibration import Calibration, CalibrationArguments
 from service.procedure.identity import ProofArguments
+from service.procedure.observe import ValidationGate
 from service.procedure.plan import Travel, check_travel
 from service.procedure.recording import RecordingArguments
-from service.procedure.sensing import ValidationGate
 from service.procedure.targets import Target, common_part_mm, fiducial_must_appear_at
 from sr_engine.reconstruction.shiftset import named, paper_random
 

@@ -20,11 +20,11 @@ from service.procedure.guide_geometry import (
     tip_of,
 )
 from service.procedure.guide_looking import GuideLook, look_at_guide, look_at_guide_longer
+from service.procedure.observe import ProcedureFailedError
 from service.procedure.plan import PlanPart
-from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steering import Standing, SteeringArguments, frames_that_decide, steer
 from service.procedure.steps import ProcedureSteps
-from service.procedure.strategies import STRATEGIES, Strategy, Way
+from service.procedure.strategies import STRATEGIES, Imaging, Strategy
 
 Array = NDArray[np.float64]
 
@@ -98,7 +98,7 @@ class SteeredGuide:
         return STRATEGIES["adaptive"]
 
     def look(
-        self, calibration: Calibration, way: Way, *, number: int, fresh: bool
+        self, calibration: Calibration, way: Imaging, *, number: int, fresh: bool
     ) -> ProcedureSteps[GuideLook]:
         arguments = self.arguments
         return look_at_guide(arguments.geometry, calibration, arguments.gate, fresh=fresh)
@@ -147,7 +147,7 @@ class SteeredGuide:
     def is_sure(self, estimate: FiducialEstimate) -> bool:
         return self.probability(estimate) >= self.arguments.confidence
 
-    def is_there(self, calibration: Calibration, way: Way) -> bool:
+    def is_there(self, calibration: Calibration, way: Imaging) -> bool:
         return self.is_sure(calibration.estimate)
 
     def why_not_there(self, estimate: FiducialEstimate) -> str:

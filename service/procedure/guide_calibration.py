@@ -20,7 +20,7 @@ from service.procedure.estimate import FiducialEstimate
 from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_looking import BothSeen, gates, see_both
 from service.procedure.jacobian import SMALLEST_ANGLE_DEG, ImageJacobian
-from service.procedure.sensing import (
+from service.procedure.observe import (
     ML,
     TEMPLATE,
     Expectation,

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.procedure.estimate import FiducialEstimate
-from service.procedure.kinematics import Line
+from service.procedure.kinematics import NeedleLine
 from service.procedure.plane import ImagePlane
 
 Array = NDArray[np.float64]
@@ -73,7 +73,7 @@ def state_on_line(
 
 def line_of_state(
     geometry: GuideGeometry, state_mm: Array, plane: ImagePlane, lower_plane_mm: float
-) -> Line:
+) -> NeedleLine:
     """The guide's line in patient mm (LPS), its point the lower ball joint, upwards.
 
     state_mm: (4,). lower_plane_mm: of the lower ball joint along the slice normal. Raises
@@ -90,4 +90,4 @@ def line_of_state(
     along_normal = np.sign(upper_mm - lower_mm) * np.sqrt(1.0 - sine**2)
     direction = plane.direction(across) + along_normal * plane.normal
     foot = state_mm[2:] - geometry.lower_along_mm * across
-    return Line(plane.direction(foot) + lower_plane_mm * plane.normal, direction)
+    return NeedleLine(plane.direction(foot) + lower_plane_mm * plane.normal, direction)

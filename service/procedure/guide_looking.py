@@ -10,8 +10,7 @@ import numpy as np
 from service.procedure.calibration import BY_DISC, Calibration, FoundBy
 from service.procedure.estimate import FiducialEstimate
 from service.procedure.guide_geometry import GuideGeometry
-from service.procedure.plane import ImagePlane
-from service.procedure.sensing import (
+from service.procedure.observe import (
     ML,
     Expectation,
     ProcedureFailedError,
@@ -19,6 +18,7 @@ from service.procedure.sensing import (
     measure_again,
     measure_here,
 )
+from service.procedure.plane import ImagePlane
 from service.procedure.steps import Acquired, Measured, ProcedureSteps
 
 Expectations = tuple[Expectation | None, Expectation | None]

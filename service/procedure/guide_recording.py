@@ -17,8 +17,8 @@ from service.procedure.guide_geometry import (
 )
 from service.procedure.guide_looking import GuideLook, look_at_guide, look_at_guide_longer
 from service.procedure.identity import ProofArguments, show_that_it_follows
-from service.procedure.kinematics import Line
-from service.procedure.sensing import ProcedureFailedError, ValidationGate, check_prediction
+from service.procedure.kinematics import NeedleLine
+from service.procedure.observe import ProcedureFailedError, ValidationGate, check_prediction
 from service.procedure.steps import ProcedureSteps
 
 _MOST_FRAMES = 8
@@ -44,7 +44,7 @@ class GuidePlace:
     """The guide's line now (patient mm), its tip's uncertainty, and what finding it out took."""
 
     calibration: Calibration
-    line: Line
+    line: NeedleLine
     tip_below_joint_mm: float
     sigma_mm: float
     frames: int

@@ -15,14 +15,14 @@ import numpy as np
 
 from service.procedure.calibration import Calibration
 from service.procedure.estimate import FiducialEstimate
-from service.procedure.plan import Plan, PlanRefusedError, Travel, plan_move
-from service.procedure.sensing import (
+from service.procedure.observe import (
     ProcedureFailedError,
     ValidationGate,
     ask_to_confirm,
     check_prediction,
     move,
 )
+from service.procedure.plan import Plan, PlanRefusedError, Travel, plan_move
 from service.procedure.steps import MoveTo, ProcedureSteps
 
 # so far from standing still that chance does not do it

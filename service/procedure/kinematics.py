@@ -30,14 +30,14 @@ class OutOfReachError(KinematicsError):
 
 
 @dataclass(frozen=True, eq=False)
-class Line:
+class NeedleLine:
     """A straight line in space: a point (3,) mm and a unit direction (3,), upwards for a guide."""
 
     point_mm: Array
     direction: Array
 
     @classmethod
-    def through(cls, lower_mm: ArrayLike, upper_mm: ArrayLike) -> Line:
+    def through(cls, lower_mm: ArrayLike, upper_mm: ArrayLike) -> NeedleLine:
         """From a lower to an upper point; raises KinematicsError where they are the same."""
         lower, upper = np.asarray(lower_mm, dtype=float), np.asarray(upper_mm, dtype=float)
         length = float(np.linalg.norm(upper - lower))
@@ -106,10 +106,10 @@ def ball_joints(mechanism: Mechanism, stage_mm: Mapping[str, float]) -> tuple[Ar
     return upper[:3], lower[:3]
 
 
-def guide_line(mechanism: Mechanism, stage_mm: Mapping[str, float]) -> Line:
+def guide_line(mechanism: Mechanism, stage_mm: Mapping[str, float]) -> NeedleLine:
     """The guide: its point is the lower ball joint, its direction goes to the upper one."""
     upper, lower = ball_joints(mechanism, stage_mm)
-    return Line.through(lower, upper)
+    return NeedleLine.through(lower, upper)
 
 
 def fiducial_mm(
@@ -128,7 +128,7 @@ def fiducial_jacobian(
     joint by s/L (I - u uT), and with the lower joint by the identity less that.
     """
     upper, lower = ball_joints(mechanism, stage_mm)
-    line = Line.through(lower, upper)
+    line = NeedleLine.through(lower, upper)
     across = np.eye(3) - np.outer(line.direction, line.direction)
     share = along_guide_mm / float(np.linalg.norm(upper - lower)) * across
     return np.hstack(
@@ -142,7 +142,7 @@ def fiducial_jacobian(
 # Inverse
 
 
-def stage_from_line(mechanism: Mechanism, line: Line) -> dict[str, float]:
+def stage_from_line(mechanism: Mechanism, line: NeedleLine) -> dict[str, float]:
     """Stage positions (mm, all four axes) that put the guide onto the line.
 
     Raises KinematicsError for a line that runs along a stage plane. Travel is not looked at.
@@ -152,7 +152,7 @@ def stage_from_line(mechanism: Mechanism, line: Line) -> dict[str, float]:
     return dict(zip(AXES, (*upper.tolist(), *lower.tolist()), strict=True))
 
 
-def _crossing(base_from_stage: Array, line: Line, name: str) -> Array:
+def _crossing(base_from_stage: Array, line: NeedleLine, name: str) -> Array:
     """Where the line meets a stage's plane, in the stage's own (x, y)."""
     turn, origin = base_from_stage[:3, :3], base_from_stage[:3, 3]
     normal = turn[:, 2]
@@ -165,15 +165,15 @@ def _crossing(base_from_stage: Array, line: Line, name: str) -> Array:
 
 def line_from_fiducials(
     upper_mm: ArrayLike, lower_mm: ArrayLike, lower_along_guide_mm: float
-) -> Line:
+) -> NeedleLine:
     """The guide's line from the centres of its two fiducials (base mm); point: the lower joint."""
-    line = Line.through(lower_mm, upper_mm)
-    return Line(line.at(-lower_along_guide_mm), line.direction)
+    line = NeedleLine.through(lower_mm, upper_mm)
+    return NeedleLine(line.at(-lower_along_guide_mm), line.direction)
 
 
-def line_from_entry_and_target(entry_mm: ArrayLike, target_mm: ArrayLike) -> Line:
+def line_from_entry_and_target(entry_mm: ArrayLike, target_mm: ArrayLike) -> NeedleLine:
     """The needle's line from the entry point on the skin to the target, same frame for both."""
-    return Line.through(target_mm, entry_mm)
+    return NeedleLine.through(target_mm, entry_mm)
 
 
 # Workspace
@@ -215,7 +215,7 @@ def reachable_rectangle_mm(
 # The needle
 
 
-def depth_to_target_mm(mechanism: Mechanism, line: Line, target_mm: ArrayLike) -> float:
+def depth_to_target_mm(mechanism: Mechanism, line: NeedleLine, target_mm: ArrayLike) -> float:
     """Insertion depth: from the guide's face to where the needle is nearest to the target.
 
     line: of the guide, its point the lower ball joint.
@@ -224,6 +224,6 @@ def depth_to_target_mm(mechanism: Mechanism, line: Line, target_mm: ArrayLike) -
     return mechanism.guide_face_mm - float(offset @ line.direction)
 
 
-def tip_mm(line: Line, beyond_lower_joint_mm: float) -> Array:
+def tip_mm(line: NeedleLine, beyond_lower_joint_mm: float) -> Array:
     """The needle's tip (3,) so far below the lower joint, along the guide."""
     return line.at(-beyond_lower_joint_mm)

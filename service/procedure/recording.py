@@ -11,9 +11,9 @@ import numpy as np
 from service.procedure.calibration import Calibration
 from service.procedure.estimate import FiducialEstimate, axis_sigma
 from service.procedure.identity import ProofArguments, show_that_it_follows
-from service.procedure.sensing import ValidationGate, check_prediction
+from service.procedure.observe import ValidationGate, check_prediction
 from service.procedure.steps import ProcedureSteps
-from service.procedure.strategies import STRATEGIES, Look, look_at_fiducial, look_longer
+from service.procedure.strategies import STRATEGIES, Observation, look_at_fiducial, look_longer
 
 _MOST_FRAMES = 8
 
@@ -90,7 +90,7 @@ def record_place(arguments: RecordingArguments, start: Calibration) -> Procedure
     return _place(start, estimate, look)
 
 
-def _place(start: Calibration, estimate: FiducialEstimate, look: Look) -> Place:
+def _place(start: Calibration, estimate: FiducialEstimate, look: Observation) -> Place:
     calibration = replace(start, estimate=estimate, measurement_id=look.measurement_id)
     return Place(calibration, look.frames, look.scan_s)
 

@@ -15,9 +15,9 @@ from service.procedure.guide_calibration import GuideCalibrationArguments, calib
 from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.guide_recording import GuidePlace, GuideRecordingArguments, record_guide
 from service.procedure.identity import ProofArguments
+from service.procedure.observe import ValidationGate, move
 from service.procedure.recording import Place, RecordingArguments, record_place
 from service.procedure.scan_frame import calibration_good_since, frame_of, other_place_since
-from service.procedure.sensing import ValidationGate, move
 from service.procedure.steps import MoveTo, ProcedureSteps
 
 CALIBRATION = "calibration"

@@ -16,16 +16,16 @@ from numpy.typing import NDArray
 from service.procedure.calibration import Calibration, learn_from_move
 from service.procedure.estimate import FiducialEstimate
 from service.procedure.identity import PROOF, moved_visibly, proof_plan
-from service.procedure.plan import Plan, PlanPart, PlanRefusedError, Travel, plan_move
-from service.procedure.sensing import (
+from service.procedure.observe import (
     ProcedureFailedError,
     ValidationGate,
     ask_to_confirm,
     check_prediction,
     move,
 )
+from service.procedure.plan import Plan, PlanPart, PlanRefusedError, Travel, plan_move
 from service.procedure.steps import MoveTo, ProcedureSteps
-from service.procedure.strategies import Strategy, Way
+from service.procedure.strategies import Imaging, Strategy
 
 _LOOSE_MM = 0.25
 _MOST_PROOFS = 2
@@ -125,7 +125,7 @@ class Steered(Protocol[LookT]):
         """As the operator calls what is moved."""
 
     def look(
-        self, calibration: Calibration, way: Way, *, number: int, fresh: bool
+        self, calibration: Calibration, way: Imaging, *, number: int, fresh: bool
     ) -> ProcedureSteps[LookT]:
         """Look from where the robot stands; number: of the look, from zero."""
 
@@ -138,7 +138,7 @@ class Steered(Protocol[LookT]):
     def parts(self, estimate: FiducialEstimate) -> tuple[PlanPart, ...]:
         """How far each thing that the operator is told of is from where it should be."""
 
-    def is_there(self, calibration: Calibration, way: Way) -> bool:
+    def is_there(self, calibration: Calibration, way: Imaging) -> bool:
         """Whether this is the place to puncture, as far as can be said of it."""
 
     def why_not_there(self, estimate: FiducialEstimate) -> str:
@@ -197,7 +197,7 @@ def steer(steered: Steered[LookT], start: Calibration) -> ProcedureSteps[Standin
 
 
 def _prove(
-    steered: Steered[LookT], standing: Standing[LookT], way: Way
+    steered: Steered[LookT], standing: Standing[LookT], way: Imaging
 ) -> ProcedureSteps[Standing[LookT]]:
     """Move by part of a pixel: what is seen must go with it; raises ProcedureFailedError if not."""
     if standing.proofs == _MOST_PROOFS:
@@ -228,7 +228,7 @@ def _is_loose(estimate: FiducialEstimate, tolerance_mm: float) -> bool:
 
 
 def _look(
-    steered: Steered[LookT], standing: Standing[LookT], way: Way
+    steered: Steered[LookT], standing: Standing[LookT], way: Imaging
 ) -> ProcedureSteps[Standing[LookT]]:
     """Look from where the robot stands; what was predicted must be what is seen."""
     prior = standing.calibration.estimate
@@ -297,7 +297,7 @@ def _go(
     steered: Steered[LookT],
     standing: Standing[LookT],
     plan: Plan,
-    way: Way,
+    way: Imaging,
     purpose: str = "approach",
 ) -> ProcedureSteps[Standing[LookT]]:
     """Carry out the plan, look, and learn from the move."""

@@ -10,8 +10,7 @@ import numpy as np
 
 from service.procedure.calibration import Calibration
 from service.procedure.estimate import FiducialEstimate
-from service.procedure.plane import ImagePlane
-from service.procedure.sensing import (
+from service.procedure.observe import (
     ProcedureFailedError,
     ValidationGate,
     estimate_from,
@@ -19,12 +18,13 @@ from service.procedure.sensing import (
     measure_here,
     measure_shift_set,
 )
+from service.procedure.plane import ImagePlane
 from service.procedure.steps import Acquired, Measured, ProcedureSteps
 from sr_engine.reconstruction.shiftset import paper_random
 
 
 @dataclass(frozen=True)
-class Way:
+class Imaging:
     """One way to look: the engine's method, the paper's random shift set or one place, and how
     many pixels of the image looked at make one of the slice's (along an axis)."""
 
@@ -37,13 +37,13 @@ class Way:
 class Strategy:
     """fuses: measurements and moves are combined, else the last look alone is believed."""
 
-    coarse: Way
-    fine: Way
+    coarse: Imaging
+    fine: Imaging
     fuses: bool = False
 
 
-_ML, _BASE = Way("ml"), Way("base")
-_BICUBIC, _SR = Way("bicubic", factor=2), Way("sr", shifted=True, factor=2)
+_ML, _BASE = Imaging("ml"), Imaging("base")
+_BICUBIC, _SR = Imaging("bicubic", factor=2), Imaging("sr", shifted=True, factor=2)
 STRATEGIES: Mapping[str, Strategy] = MappingProxyType(
     {
         "base": Strategy(_BASE, _BASE),
@@ -56,7 +56,7 @@ STRATEGIES: Mapping[str, Strategy] = MappingProxyType(
 
 
 @dataclass(frozen=True, eq=False)
-class Look:
+class Observation:
     """What was seen from where the robot stands now.
 
     found: from this look alone; prior: what was believed before it; acquired: the hold at which
@@ -88,14 +88,14 @@ class Look:
 
 
 def look_at_fiducial(
-    way: Way,
+    way: Imaging,
     calibration: Calibration,
     gate: ValidationGate,
     *,
     seed: tuple[int, int],
     fresh: bool,
-) -> ProcedureSteps[Look]:
-    """Look in one of the ways; seed: of the shift set, with each look another one."""
+) -> ProcedureSteps[Observation]:
+    """Observation in one of the ways; seed: of the shift set, with each look another one."""
     prior = calibration.estimate
     expectation = gate.around(prior)
     if not way.shifted:
@@ -105,7 +105,7 @@ def look_at_fiducial(
         )
         _check_plane(measured, calibration.plane)
         found = estimate_from(measured, prior.setpoints_um)
-        return Look(measured, found, prior, way.method, acquired, template)
+        return Observation(measured, found, prior, way.method, acquired, template)
     shifts_px = paper_random(np.random.default_rng(seed)).shifts_px
     result = yield from measure_shift_set(
         prior,
@@ -118,13 +118,13 @@ def look_at_fiducial(
         calibration.template_of(),
     )
     _check_plane(result.measured, calibration.plane)
-    return Look(result.measured, result.estimate, prior, way.method, None)
+    return Observation(result.measured, result.estimate, prior, way.method, None)
 
 
 def look_longer(
-    seen: Look, acquired: Acquired, gate: ValidationGate, *, frames: int
-) -> ProcedureSteps[Look]:
-    """Look again with `frames` slices in all from the same hold."""
+    seen: Observation, acquired: Acquired, gate: ValidationGate, *, frames: int
+) -> ProcedureSteps[Observation]:
+    """Observation again with `frames` slices in all from the same hold."""
     expectation = gate.around(seen.prior)
     more, measured = yield from measure_again(
         acquired, seen.method, expectation, frames=frames, template=seen.template

@@ -14,9 +14,9 @@ from room_config.service import GuideConfig
 from service.procedure.calibration import Calibration
 from service.procedure.fiducial_plan import gate_of
 from service.procedure.identity import ProofArguments
+from service.procedure.initial_estimate import is_proven, start_point
 from service.procedure.plan import Travel
 from service.procedure.registry import latest_calibration
-from service.procedure.start_point import is_proven, start_point
 from service.room.belief.goal import effective
 from service.room.execution import Execution
 from service.room.link import RoomLink
@@ -34,7 +34,7 @@ def now_of(config: Config, link: RoomLink) -> Now:
 
 
 @dataclass(frozen=True, eq=False)
-class Room:
+class RoomContext:
     """What commands act on, and what they have in common."""
 
     config: Config

@@ -28,11 +28,11 @@ from service.procedure.approach import Arrival
 from service.procedure.calibration import Calibration
 from service.procedure.guide_approach import GuideArrival
 from service.procedure.guide_recording import GuidePlace
+from service.procedure.observe import ProcedureFailedError
 from service.procedure.recording import Place
 from service.procedure.registry import build_procedure, result_to_json
 from service.procedure.runner import ReplayMismatchError, run_procedure
 from service.procedure.scan_frame import frame_of
-from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steps import Outcome, Step
 from service.procedure.targets import ENTRY_SET, TARGET_SET
 from service.room.alarms import Condition
@@ -40,15 +40,15 @@ from service.room.cases.between import BetweenCases
 from service.room.cases.life import CaseLife, is_finished, set_at_rest
 from service.room.commands.commands import Commands
 from service.room.conditions import conditions
-from service.room.context import Room
+from service.room.context import RoomContext
 from service.room.counts.correct import correct_counts
-from service.room.describe import Describer, ProcessLook, describe_robot
 from service.room.execution import Execution, ProcedureAbortedError
 from service.room.integrity import doubt_of, doubt_of_arrival
 from service.room.link import RoomLink
 from service.room.readiness import ConflictError
 from service.room.scanner_clock import ClockWatch, note_step
 from service.room.state import RoomState
+from service.room.state_view import Describer, ProcessLook, describe_robot
 from service.room.stop_latch import StopLatch
 from service.room.trouble import RECORD_FAULTS, Trouble, held
 
@@ -274,7 +274,7 @@ class ControlLoop:
         if life.asks:
             set_at_rest(record)
         execution = Execution(self._config, record, self._link, self._tick)
-        room = Room(self._config, record, self._link, execution, self._stops)
+        room = RoomContext(self._config, record, self._link, execution, self._stops)
         self._record, self._execution = record, execution
         if self._clock.is_news_to(record):
             note_step(record, self._clock.stepped_s)

@@ -13,10 +13,10 @@ from robot_bridge.client.client import BridgeStatus, LinkLostError, MoveOutcome,
 from robot_bridge.protocol.messages import Code, CommandState
 from robot_bridge.protocol.phases import WorkPhase, motion_allowed
 from room_config.load import Config
+from service.procedure.observe import ABORT, CONFIRM, ProcedureFailedError
 from service.procedure.plan import PLAN_VOID, why_void
 from service.procedure.runner import measurement_name
 from service.procedure.scan_frame import ScanFrame, frame_of
-from service.procedure.sensing import ABORT, CONFIRM, ProcedureFailedError
 from service.procedure.steps import (
     Acquire,
     Acquired,

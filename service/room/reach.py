@@ -10,7 +10,7 @@ from service.procedure.guide_plan import guide_approach_of
 from service.procedure.plan import PlanRefusedError, plan_move
 from service.procedure.registry import latest_calibration
 from service.procedure.targets import Target, TargetError, current_entry
-from service.room.context import Room
+from service.room.context import RoomContext
 from service.room.proposals import Plan, Point3
 
 
@@ -22,7 +22,7 @@ class ReachUnknownError(Exception):
     """Nobody can tell yet; the text says what is missing."""
 
 
-def check_reach(room: Room, plan: Plan, *, in_water: bool = False) -> None:
+def check_reach(room: RoomContext, plan: Plan, *, in_water: bool = False) -> None:
     """What an approach would work out from where the robot stands, without starting one.
 
     Raises OutOfReachError or ReachUnknownError.
@@ -62,7 +62,7 @@ def check_reach(room: Room, plan: Plan, *, in_water: bool = False) -> None:
         raise OutOfReachError(str(error)) from error
 
 
-def entry_of(room: Room, plan: Plan, start: Calibration) -> Point3:
+def entry_of(room: RoomContext, plan: Plan, start: Calibration) -> Point3:
     """The entry point: the plan's own; where its line leaves the guide; or the one that is set."""
     guide = room.config.service.guide
     if plan.entry_mm is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from robot_bridge.client.client import BridgeError
-from service.room.context import SOURCE, Room
+from service.room.context import SOURCE, RoomContext
 from service.room.motion_allowed import lock_wanted
 from service.room.present import (
     READY,
@@ -15,7 +15,7 @@ from service.room.present import (
 )
 
 
-def keep_ready(room: Room) -> None:
+def keep_ready(room: RoomContext) -> None:
     """Set the insertion lock where it is wanted; write down when READY is said and when it is lost.
 
     Nobody asks for this: the control loop does it all the time.
@@ -26,7 +26,7 @@ def keep_ready(room: Room) -> None:
         _write_down(room, readiness(room.record, room.now()))
 
 
-def _set_lock(room: Room, found: Readiness | None) -> bool:
+def _set_lock(room: RoomContext, found: Readiness | None) -> bool:
     """Set the lock if it is wanted and missing; whether it was set now."""
     status = room.link.status
     if status is None or status.insertion_locked or status.moving:
@@ -41,7 +41,7 @@ def _set_lock(room: Room, found: Readiness | None) -> bool:
     return True
 
 
-def _write_down(room: Room, found: Readiness | None) -> None:
+def _write_down(room: RoomContext, found: Readiness | None) -> None:
     if found is None:
         return
     said = was_ready(room.record, found.procedure_id)

@@ -61,7 +61,7 @@ _FIDUCIAL_RGB, _TARGET_RGB, _ENTRY_RGB = (255, 200, 0), (0, 255, 120), (0, 160, 
 
 
 @dataclass(frozen=True)
-class Standing:
+class SceneState:
     """What of a state is true now; what is not is None."""
 
     measurement: MeasurementState | None
@@ -70,14 +70,14 @@ class Standing:
     reconstruction: ReconstructionState | None
 
 
-def standing(state: RoomState) -> Standing:
+def standing(state: RoomState) -> SceneState:
     """The one place that asks whether what was seen still holds; `present` has said so."""
     seen, other, made = state.measurement, state.other_fiducial, state.reconstruction
     still = state.robot.linked and not state.robot.moving
     shown = seen if still and seen and seen.patient_mm and seen.lost is None else None
     other = other if still and other and other.lost is None else None
     numbers = {one.measurement_id for one in (shown, other) if one is not None}
-    return Standing(
+    return SceneState(
         measurement=shown,
         other_fiducial=other,
         arrival=state.arrival if state.ready else None,
@@ -185,7 +185,7 @@ def _status(state: RoomState) -> Message:
     return status_of(state, "AutoSPINe", name)
 
 
-def _fiducials(state: RoomState, now: Standing, guide: GuideConfig | None) -> list[Point]:
+def _fiducials(state: RoomState, now: SceneState, guide: GuideConfig | None) -> list[Point]:
     """By name, not by which was seen last: receivers tell them apart by place in the list too."""
     found = []
     if now.measurement is not None and now.measurement.patient_mm is not None:

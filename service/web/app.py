@@ -33,7 +33,7 @@ from service.web.orders import Orders
 from service.web.papers import Papers
 from service.web.problems import Problem, add_problems, problem, responses
 from service.web.readers import Readers
-from service.web.request_guard import Gate
+from service.web.request_guard import RequestGuard
 from service.web.routes.access import access_router
 from service.web.routes.cases import case_router
 from service.web.routes.documents import document_router
@@ -118,7 +118,9 @@ def create_app(
     access = Access(access_rules(config))
     ending: list[Callable[[], None]] = []
     app.add_middleware(Readers, config=config, stopping=ending)
-    app.add_middleware(Gate, access=access, uses_tls=uses_tls, public_url=service.public_url)
+    app.add_middleware(
+        RequestGuard, access=access, uses_tls=uses_tls, public_url=service.public_url
+    )
     add_problems(app)
     app.state.cases = cases
     orders = Orders(loop)

@@ -8,7 +8,7 @@ import threading
 from pathlib import Path
 
 from room_config.shell import autospine
-from service.web.elsewhere import run_elsewhere
+from service.web.own_process import run_elsewhere
 from service.web.problems import ProblemError
 
 _PATIENCE_S = 600.0

@@ -25,7 +25,7 @@ class _Done:
     at_s: float
 
 
-class Once:
+class IdempotencyKeys:
     """Remembers what was answered to each key, for a day, in this process."""
 
     def __init__(self) -> None:

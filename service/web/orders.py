@@ -10,7 +10,7 @@ from fastapi import Depends, Header, Request
 
 from service.room.control import ControlLoop
 from service.web.access import Identity
-from service.web.idempotency import Once
+from service.web.idempotency import IdempotencyKeys
 from service.web.problems import responses
 from service.web.schemas import Ask
 
@@ -59,7 +59,7 @@ class Orders:
 
     def __init__(self, loop: ControlLoop) -> None:
         self._loop = loop
-        self._once = Once()
+        self._once = IdempotencyKeys()
 
     def carry_out(
         self, caller: Identity, key: str | None, name: str, body: Ask, **path: Any

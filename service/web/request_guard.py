@@ -42,7 +42,7 @@ SECURITY_HEADERS = {
 }
 
 
-class Gate:
+class RequestGuard:
     """Wraps the application; puts the caller's `identity` and public_url's path (`prefix`) into
     `scope["state"]`.
     """

@@ -16,10 +16,10 @@ from bench.optics import Resampler, colour_plane, learn_lens, read_lens, sheet_o
 from bench.slice_writer import BenchAcquisition, BenchStudy, write_bench_slice
 from bench.slices import BenchCamera, focus_of
 from bench.source import Exposure, FrameSource, QueueWatch, picture_files, read_picture
+from dicom_slice.eligibility import SliceRules, why_not_usable
 from dicom_slice.header import slices_of
 from dicom_slice.quirks import Kind
 from dicom_slice.reasons import Reason
-from dicom_slice.usable import SliceRules, why_not_usable
 from simulator.bench_camera import Scene, VirtualCamera, jpeg, write_board
 
 CONFIG = {"source": "0", "sensor_px_per_mm": 1.5}

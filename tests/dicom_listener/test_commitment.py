@@ -12,7 +12,7 @@ from pynetdicom.sop_class import StorageCommitmentPushModel, StorageCommitmentPu
 from test_listener_process import alarms, send
 
 from case_record.record import CaseRecord
-from dicom_listener.requestor import mended
+from dicom_listener.association_fix import mended
 from dicom_slice.quirks import MR_IMAGE
 from room_config.listener import ListenerConfig
 

@@ -4,8 +4,8 @@ from listener_room import a_slice
 
 from dicom_listener.assign import Assigned, AssignRules, HoldWindow, Known, Quarantined, assign
 from dicom_listener.clock import OffsetBounds
+from dicom_slice.eligibility import SliceRules, why_not_usable
 from dicom_slice.reasons import Reason
-from dicom_slice.usable import SliceRules, why_not_usable
 
 FIRST = HoldWindow(1, 1, 900.0, 950.0, 0)
 STANDING = HoldWindow(2, 2, 990.0, None, 2)

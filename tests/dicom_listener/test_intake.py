@@ -17,10 +17,10 @@ from dicom_listener.clock import ClockRules, Comparison
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope, sha256_of
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
-from dicom_listener.overrule import give_up_slices, reset_clock, sync_clock
+from dicom_listener.operator_actions import give_up_slices, reset_clock, sync_clock
 from dicom_listener.retention import remove_old
+from dicom_slice.eligibility import SliceRules
 from dicom_slice.quirks import ENHANCED_MR_IMAGE
-from dicom_slice.usable import SliceRules
 
 
 class Desk:

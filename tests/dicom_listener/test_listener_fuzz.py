@@ -13,13 +13,13 @@ from pynetdicom.pdu import A_ASSOCIATE_RQ
 from pynetdicom.pdu_primitives import A_ASSOCIATE
 
 from case_record.record import CaseRecord
+from dicom_listener.association_fix import mended
 from dicom_listener.inbox import Envelope, Inbox, sha256_of
-from dicom_listener.requestor import mended
 from dicom_slice.decode_guard import DecodeGuard
+from dicom_slice.eligibility import SliceRules, why_not_usable
 from dicom_slice.header import read_header
 from dicom_slice.quirks import MR_IMAGE
 from dicom_slice.reasons import Reason, UnusableError
-from dicom_slice.usable import SliceRules, why_not_usable
 
 # Seeds that once did harm: a codec that panicked, one that aborted the process.
 KEPT_SEEDS = (2779, 2785)

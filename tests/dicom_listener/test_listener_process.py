@@ -30,10 +30,10 @@ from pynetdicom import AE, evt
 from pynetdicom.association import Association
 
 from case_record.record import CaseRecord
+from dicom_listener.association_fix import mended
 from dicom_listener.inbox import is_whole, read_envelope
-from dicom_listener.overrule import reassign, sync_clock
+from dicom_listener.operator_actions import reassign, sync_clock
 from dicom_listener.process import run
-from dicom_listener.requestor import mended
 from dicom_listener.slice_rows import slice_from_record
 from dicom_slice.header import read_header
 from dicom_slice.pixels import magnitude_pixels

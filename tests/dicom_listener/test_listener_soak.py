@@ -11,7 +11,7 @@ from pydicom.uid import ExplicitVRLittleEndian
 from pynetdicom import AE
 
 from case_record.record import CaseRecord
-from dicom_listener.requestor import mended
+from dicom_listener.association_fix import mended
 from dicom_slice.quirks import MR_IMAGE
 
 

@@ -9,11 +9,11 @@ from pydicom import dcmread
 from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian
 from real_slices import DICOM
 
+from dicom_slice.eligibility import BY_HAND, SliceRules, why_not_usable
 from dicom_slice.header import read_header, slices_of
 from dicom_slice.pixels import check_pixels, magnitude_pixels
 from dicom_slice.quirks import Kind
 from dicom_slice.reasons import Reason, UnusableError
-from dicom_slice.usable import BY_HAND, SliceRules, why_not_usable
 
 ROWS, COLS = np.indices((48, 40))
 STORED = (ROWS * 40 + COLS).astype(np.uint16)

@@ -1,6 +1,6 @@
 """The private members of pynetdicom that the listener and the outbox replace still mean the same.
 
-A new release that fails here needs a look at `transport.py` and `requestor.py`; until then
+A new release that fails here needs a look at `transport.py` and `association_fix.py`; until then
 `pyproject.toml` keeps pynetdicom below it.
 """
 

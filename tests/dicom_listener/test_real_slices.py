@@ -9,12 +9,12 @@ import pydicom
 import pytest
 from real_slices import DICOM, IS_LARGE_SET, manifest, needs_large_set
 
+from dicom_slice.eligibility import SliceRules, why_not_usable
 from dicom_slice.header import read_header
 from dicom_slice.pixels import check_pixels, magnitude_pixels
 from dicom_slice.quirks import Kind
 from dicom_slice.read import dicom_files, read_frames
 from dicom_slice.reasons import Reason, UnusableError
-from dicom_slice.usable import SliceRules, why_not_usable
 
 USED = "used"
 ANY_ORIENTATION = SliceRules(coronal_tolerance_deg=None)

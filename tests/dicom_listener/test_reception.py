@@ -15,7 +15,7 @@ from dicom_listener.case_gate import recorded_binding
 from dicom_listener.inbox import Envelope, Inbox, sha256_of
 from dicom_listener.intake import IntakeRules
 from dicom_listener.metrics import ListenerMetrics
-from dicom_listener.overrule import sync_clock
+from dicom_listener.operator_actions import sync_clock
 from dicom_listener.reception import Reception
 from dicom_listener.taking import TakingError, accept_frame, take_study
 

@@ -10,7 +10,7 @@ from pynetdicom import AE, evt
 from pynetdicom.association import Association
 from pynetdicom.dimse import DIMSEServiceProvider
 
-from dicom_listener.requestor import mended
+from dicom_listener.association_fix import mended
 from dicom_slice.quirks import MR_IMAGE
 
 

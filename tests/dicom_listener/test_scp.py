@@ -25,10 +25,10 @@ from pynetdicom.association import Association
 from pynetdicom.dimse_primitives import C_STORE
 from real_slices import DICOM
 
+from dicom_listener.association_fix import mended
 from dicom_listener.inbox import Inbox, data_set_bytes, is_whole, read_envelope
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.negotiation import VERIFICATION
-from dicom_listener.requestor import mended
 from dicom_listener.scp import Scp, ScpRules, tls_context
 from dicom_listener.transport import acknowledge_at_once
 from dicom_slice.quirks import MR_CLASSES, MR_IMAGE

@@ -9,9 +9,9 @@ from real_slices import DICOM, manifest
 from test_intake import Desk
 
 from dicom_listener.clock import Comparison
+from dicom_slice.eligibility import SliceRules, why_not_usable
 from dicom_slice.header import read_header
 from dicom_slice.reasons import UnusableError
-from dicom_slice.usable import SliceRules, why_not_usable
 from sr_engine.simulate import render_disc, rician
 from sr_engine.worker import measure
 

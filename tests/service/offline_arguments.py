@@ -4,7 +4,7 @@ import numpy as np
 
 from service.procedure.approach import ApproachArguments
 from service.procedure.calibration import Calibration, CalibrationArguments
-from service.procedure.sensing import ValidationGate
+from service.procedure.observe import ValidationGate
 from sr_engine.reconstruction.shiftset import named
 
 GATE = ValidationGate(

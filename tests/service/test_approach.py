@@ -9,7 +9,7 @@ from offline_arguments import approach_arguments, beside, calibration_arguments
 from service.procedure.approach import SteeredFiducial, approach
 from service.procedure.calibration import calibrate
 from service.procedure.estimate import FiducialEstimate
-from service.procedure.sensing import CONFIRM, REJECT, ProcedureFailedError
+from service.procedure.observe import CONFIRM, REJECT, ProcedureFailedError
 from service.procedure.steps import AskOperator, MoveTo
 from simulator.config import Placement, StaticObject, VirtualRoom
 from simulator.stage_physics import StageParameters

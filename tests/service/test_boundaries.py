@@ -42,7 +42,7 @@ BOUNDARIES = {
         "service.room.execution:Execution._settled",
         "service.room.execution:Execution._wait_for_slices",
         "service.room.execution:Execution._measure",
-        "service.room.describe:Describer.describe",
+        "service.room.state_view:Describer.describe",
         "service.room.control:result_to_json",
         "service.room.commands.commands:Commands.carry_out",
         "service.room.commands.commands:Commands.keep_ready",

@@ -8,7 +8,7 @@ from offline_arguments import GATE, calibration_arguments
 
 from service.procedure.calibration import calibrate
 from service.procedure.jacobian import CalibrationError
-from service.procedure.sensing import ProcedureFailedError, move
+from service.procedure.observe import ProcedureFailedError, move
 from service.procedure.steps import MoveTo
 from service.procedure.strategies import STRATEGIES, look_at_fiducial
 from simulator.config import Fiducial, StaticObject, VirtualRoom

@@ -17,6 +17,7 @@ from case_record.record import FILE_NAME, CaseRecord
 from case_record.sealing import prepare
 from case_record.sql import MIGRATIONS
 from service.cli.replay import replay_measurements
+from service.procedure.observe import ProcedureFailedError
 from service.procedure.registry import (
     APPROACH,
     CALIBRATION,
@@ -27,7 +28,6 @@ from service.procedure.registry import (
 from service.procedure.registry import (
     calibration_arguments as calibration_json,
 )
-from service.procedure.sensing import ProcedureFailedError
 from service.procedure.steps import Acquire
 from service.room.present import Now, why_not_now
 from simulator.config import VirtualRoom

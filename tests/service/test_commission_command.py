@@ -11,7 +11,7 @@ import pytest
 from pynetdicom import AE
 from virtual_commissioning import Truth, VirtualTechnologist
 
-from dicom_listener.requestor import mended
+from dicom_listener.association_fix import mended
 from dicom_slice.quirks import MR_IMAGE
 
 ROOT = Path(__file__).parents[2]

@@ -20,13 +20,13 @@ from service.procedure.guide_geometry import (
     tip_of,
 )
 from service.procedure.guide_recording import GuideRecordingArguments, record_guide
+from service.procedure.observe import REJECT, ProcedureFailedError
 from service.procedure.registry import (
     GUIDE_APPROACH,
     GUIDE_CALIBRATION,
     guide_approach_arguments,
     guide_calibration_arguments,
 )
-from service.procedure.sensing import REJECT, ProcedureFailedError
 from service.procedure.targets import needle_line
 from simulator.config import Fiducial, VirtualRoom
 from simulator.mr_slice import slice_geometry

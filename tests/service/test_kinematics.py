@@ -8,8 +8,8 @@ from hypothesis import strategies as st
 from service.procedure.kinematics import (
     AXES,
     KinematicsError,
-    Line,
     Mechanism,
+    NeedleLine,
     OutOfReachError,
     ball_joints,
     check_reach,
@@ -133,7 +133,7 @@ def test_the_corners_of_the_reachable_rectangle_are_reached():
 def test_a_line_along_the_planes_is_refused():
     with pytest.raises(KinematicsError, match="upper stage's plane"):
         stage_from_line(
-            parallel_planes(60.0, TRAVEL), Line.through((0.0, 0.0, 10.0), (5.0, 0.0, 10.0))
+            parallel_planes(60.0, TRAVEL), NeedleLine.through((0.0, 0.0, 10.0), (5.0, 0.0, 10.0))
         )
 
 
@@ -162,7 +162,7 @@ def test_a_mechanism_that_cannot_be_is_refused(change, said):
 
 def test_one_point_twice_is_no_line():
     with pytest.raises(KinematicsError, match="do not define a line"):
-        Line.through((1.0, 2.0, 3.0), (1.0, 2.0, 3.0))
+        NeedleLine.through((1.0, 2.0, 3.0), (1.0, 2.0, 3.0))
 
 
 def test_planes_in_one_place_are_no_mechanism():

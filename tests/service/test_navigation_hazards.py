@@ -16,6 +16,7 @@ from case_record.record import CaseRecord
 from case_record.sealing import prepare
 from service.procedure.approach import approach
 from service.procedure.calibration import calibrate
+from service.procedure.observe import ABORT, RESCAN, ProcedureFailedError
 from service.procedure.plan import PLAN_VOID, why_void
 from service.procedure.registry import (
     APPROACH,
@@ -25,7 +26,6 @@ from service.procedure.registry import (
 from service.procedure.registry import approach_arguments as approach_json
 from service.procedure.registry import calibration_arguments as calibration_json
 from service.procedure.runner import ReplayMismatchError, run_procedure
-from service.procedure.sensing import ABORT, RESCAN, ProcedureFailedError
 from service.procedure.steps import AskOperator, Measure, Moved, MoveTo
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters

@@ -20,8 +20,8 @@ from case_record.record import CaseRecord, CaseRecordError
 from case_record.seals import TamperedError
 from service.cli.export import write_export
 from service.dicom_out.codes import CENTRE, CENTRE_ALONG, DEPTH, DISTANCE, PROBABILITY, TOLERANCE
+from service.dicom_out.content import finding_of_arrival, finding_of_measurement
 from service.dicom_out.errors import OutputError
-from service.dicom_out.finding import finding_of_arrival, finding_of_measurement
 from service.dicom_out.make import (
     Output,
     dataset_of,

@@ -17,8 +17,8 @@ from case_record.rows import Measurement, SliceRow
 from dicom_listener.slice_rows import header_for_record
 from dicom_slice.header import Slice, read_header
 from dicom_slice.reasons import UnusableError
+from service.dicom_out.content import Distance, ReportContent
 from service.dicom_out.errors import OutputError
-from service.dicom_out.finding import Distance, Finding
 from service.dicom_out.make import Output, dataset_of
 
 CENTRE_PX = (40.25, 51.5)
@@ -46,7 +46,7 @@ def slices_of_all_scanners() -> Iterator[tuple[Path, Slice]]:
             yield path, header
 
 
-def finding_in(path: Path, header: Slice) -> Finding:
+def finding_in(path: Path, header: Slice) -> ReportContent:
     """As if a fiducial had been found at CENTRE_PX."""
     assert header.geometry is not None
     row = SliceRow(
@@ -80,7 +80,7 @@ def finding_in(path: Path, header: Slice) -> Finding:
     }
     now_s = time.time()
     measurement = Measurement(1, "done", "ml", (1,), {}, now_s, now_s, result, "", "")
-    return Finding(
+    return ReportContent(
         case_dir=DICOM,
         case_uid="a case",
         measurement=measurement,

@@ -6,7 +6,7 @@ import pytest
 from line_room import IMAGING, patient_mm, running_line_room
 
 from case_record.record import CaseRecord, CaseRecordError
-from service.dicom_out.finding import finding_of_arrival
+from service.dicom_out.content import finding_of_arrival
 from service.dicom_out.make import outputs_to_send
 from service.dicom_out.report import comment_of
 from service.room.context import now_of

@@ -6,10 +6,10 @@ from offline_arguments import approach_arguments, beside, calibration_arguments
 
 from case_record.record import CaseRecord
 from service.procedure.estimate import MotionNoise
+from service.procedure.initial_estimate import POSITION_DECLARED, positions_to_declare, start_point
 from service.procedure.registry import APPROACH, CALIBRATION
 from service.procedure.registry import approach_arguments as approach_json
 from service.procedure.registry import calibration_arguments as calibration_json
-from service.procedure.start_point import POSITION_DECLARED, positions_to_declare, start_point
 from service.procedure.steps import MoveTo
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters

@@ -10,11 +10,11 @@ from case_record.record import CaseRecord
 from service.cli.replay import replay_measurements, replay_procedure
 from service.procedure.approach import SteeredFiducial, approach
 from service.procedure.calibration import BY_DISC, FoundBy, calibrate
+from service.procedure.observe import ProcedureFailedError, measure_here
 from service.procedure.recording import RecordingArguments, record_place
 from service.procedure.registry import APPROACH, CALIBRATION
 from service.procedure.registry import approach_arguments as recorded_approach
 from service.procedure.registry import calibration_arguments as recorded_calibration
-from service.procedure.sensing import ProcedureFailedError, measure_here
 from service.procedure.steering import why_never_sure
 from service.procedure.targets import Target, common_part_mm
 from simulator.config import CANNULATED, Fiducial, SliceProtocol, VirtualRoom

@@ -21,7 +21,7 @@ from service.procedure.calibration import calibrate
 from service.procedure.guide_calibration import _check_shares
 from service.procedure.guide_geometry import GuideGeometry
 from service.procedure.jacobian import ImageJacobian
-from service.procedure.sensing import ABORT, RESCAN, ProcedureFailedError
+from service.procedure.observe import ABORT, RESCAN, ProcedureFailedError
 from service.procedure.steps import AskOperator, Moved, MoveTo
 from service.room.state import RoomState
 from simulator.config import SliceProtocol, VirtualRoom

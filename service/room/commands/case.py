@@ -9,7 +9,7 @@ from typing import Any
 from dicom_listener.taking import TakingError, accept_frame, take_study
 from robot_bridge.client.client import BridgeError
 from service.room.cases.life import CONTINUED, FINISHED, CaseLife
-from service.room.context import Room
+from service.room.context import RoomContext
 from service.room.present import needle_may_be_in
 from service.room.readiness import ConflictError
 
@@ -19,7 +19,7 @@ WHILE_ASKING = frozenset({"note_stop", "continue_case", "finish_case", "needle_o
 class CaseCommands:
     """What may be asked of the open case."""
 
-    def __init__(self, room: Room, life: CaseLife) -> None:
+    def __init__(self, room: RoomContext, life: CaseLife) -> None:
         self._room = room
         self._life = life
 

@@ -17,14 +17,14 @@ from service.room.commands.record import RecordCommands
 from service.room.commands.robot import RobotCommands
 from service.room.commands.settings import SettingsCommands
 from service.room.commands.target import TargetCommands
-from service.room.context import Room
+from service.room.context import RoomContext
 from service.room.ready_keeper import keep_ready
 
 
 class Commands:
     """Everything that may be asked, by name."""
 
-    def __init__(self, room: Room, life: CaseLife) -> None:
+    def __init__(self, room: RoomContext, life: CaseLife) -> None:
         self._room = room
         self._case = CaseCommands(room, life)
         self._proposals = ProposalCommands(room, TargetCommands(room))
@@ -46,7 +46,7 @@ class Commands:
 
 
 def _all_of(
-    room: Room, life: CaseLife, proposals: ProposalCommands
+    room: RoomContext, life: CaseLife, proposals: ProposalCommands
 ) -> tuple[Callable[..., Any], ...]:
     robot = RobotCommands(room)
     target, procedure, record = (

@@ -13,6 +13,7 @@ from service.procedure.estimate import FiducialEstimate
 from service.procedure.fiducial_plan import approach_of, calibration_of
 from service.procedure.guide_approach import SteeredGuide
 from service.procedure.guide_plan import guide_approach_of, guide_calibration_of
+from service.procedure.observe import CONFIRM
 from service.procedure.plan import PLAN_VOID, PlanRefusedError
 from service.procedure.registry import (
     APPROACH,
@@ -25,7 +26,6 @@ from service.procedure.registry import (
     guide_calibration_arguments,
 )
 from service.procedure.scan_frame import newest_frame
-from service.procedure.sensing import CONFIRM
 from service.procedure.steering import SteeringArguments, why_never_sure
 from service.procedure.targets import (
     Target,
@@ -35,7 +35,7 @@ from service.procedure.targets import (
     current_target,
     why_void_target,
 )
-from service.room.context import Room
+from service.room.context import RoomContext
 from service.room.history import arrival_by_hand
 from service.room.present import PUNCTURE, readiness
 from service.room.readiness import ConflictError
@@ -45,7 +45,7 @@ from service.room.robot.memory import last_jacobian
 class ProcedureCommands:
     """Calibration, approach and puncture."""
 
-    def __init__(self, room: Room, cases: Cases) -> None:
+    def __init__(self, room: RoomContext, cases: Cases) -> None:
         self._room = room
         self._cases = cases
 

@@ -13,7 +13,7 @@ import structlog
 from case_record.rows import Event
 from service.procedure.registry import latest_calibration
 from service.room.commands.target import TargetCommands
-from service.room.context import Room
+from service.room.context import RoomContext
 from service.room.proposals import (
     MOST_OPEN,
     PROPOSED,
@@ -41,7 +41,7 @@ REGISTRATION = "registration_received"
 class ProposalCommands:
     """Proposals never change a plan by themselves."""
 
-    def __init__(self, room: Room, target: TargetCommands) -> None:
+    def __init__(self, room: RoomContext, target: TargetCommands) -> None:
         self._room = room
         self._target = target
         self._book = ProposalBook()

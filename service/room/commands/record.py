@@ -4,15 +4,15 @@ from __future__ import annotations
 
 import time
 
-from dicom_listener.overrule import give_up_slices, reassign, reset_clock, why_not_by_hand
-from service.room.context import Room
+from dicom_listener.operator_actions import give_up_slices, reassign, reset_clock, why_not_by_hand
+from service.room.context import RoomContext
 from service.room.readiness import ConflictError
 
 
 class RecordCommands:
     """Decisions and remarks of the operator; nothing moves by them."""
 
-    def __init__(self, room: Room) -> None:
+    def __init__(self, room: RoomContext) -> None:
         self._room = room
 
     def assign_slice(self, slice_id: int, hold_id: int | None, why: str, by: str) -> None:

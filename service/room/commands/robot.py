@@ -5,10 +5,10 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from robot_bridge.client.client import BridgeError, BridgeStatus
+from service.procedure.initial_estimate import POSITION_DECLARED
 from service.procedure.plan import PlanRefusedError, check_travel
 from service.procedure.registry import JOG
-from service.procedure.start_point import POSITION_DECLARED
-from service.room.context import Room
+from service.room.context import RoomContext
 from service.room.present import NEEDLE_OUT
 from service.room.readiness import ConflictError
 from service.room.robot.whereabouts import in_words, taken_to_stand
@@ -17,7 +17,7 @@ from service.room.robot.whereabouts import in_words, taken_to_stand
 class RobotCommands:
     """What may be asked of the robot itself."""
 
-    def __init__(self, room: Room) -> None:
+    def __init__(self, room: RoomContext) -> None:
         self._room = room
 
     def reset(self, by: str, positions_um: Mapping[str, int] | None = None) -> None:

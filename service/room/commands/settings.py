@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from room_config.service import STRATEGIES
 from service.room.belief.goal import SETTINGS_CHANGED, bounds_of
-from service.room.context import Room
+from service.room.context import RoomContext
 from service.room.readiness import ConflictError
 
 
 class SettingsCommands:
     """Changes them; what runs goes on with what it began with."""
 
-    def __init__(self, room: Room) -> None:
+    def __init__(self, room: RoomContext) -> None:
         self._room = room
 
     def change_settings(

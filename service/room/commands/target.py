@@ -18,7 +18,7 @@ from service.procedure.targets import (
     current_target,
     target_that_can_be_taken,
 )
-from service.room.context import Room
+from service.room.context import RoomContext
 from service.room.proposals import Plan, why_not_in_bore, why_senseless
 from service.room.reach import OutOfReachError, ReachUnknownError, check_reach
 from service.room.readiness import ConflictError
@@ -28,7 +28,7 @@ from service.room.summaries import PointMm
 class TargetCommands:
     """Target and entry point; a plan that waits for confirmation is void when they change."""
 
-    def __init__(self, room: Room) -> None:
+    def __init__(self, room: RoomContext) -> None:
         self._room = room
 
     def set_target(

@@ -12,7 +12,7 @@ from fastapi.responses import FileResponse
 from pydantic import BaseModel
 
 from room_config.load import Config
-from service.dicom_out.finding import (
+from service.dicom_out.content import (
     finding_of_arrival,
     finding_of_measurement,
     finding_of_puncture,
@@ -20,8 +20,8 @@ from service.dicom_out.finding import (
 from service.dicom_out.make import FOLDER, Kind, Output
 from service.dicom_out.outbox_store import FILE_NAME, STATES, OutboxStore, State
 from service.room.images import ImageMissingError
-from service.web.elsewhere import run_elsewhere
 from service.web.of_case import AskedCase, OfCase
+from service.web.own_process import run_elsewhere
 from service.web.pagination import ERRORS, Id
 from service.web.problems import ProblemError, responses
 

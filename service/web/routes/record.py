@@ -8,7 +8,7 @@ from fastapi import APIRouter, Query, Request, Response
 
 from case_record.record import CaseRecord
 from case_record.rows import SliceRow
-from dicom_listener.overrule import offered_hold
+from dicom_listener.operator_actions import offered_hold
 from service.room.history import known_targets, past_cases, targets_over_time
 from service.room.summaries import CaseSummary, KnownTarget, MeasurementBody
 from service.web.of_case import OfCase, RoomCases

@@ -26,15 +26,15 @@ from service.room.cases.held import HeldSlices, arriving
 from service.room.cases.life import QUESTION, CaseLife
 from service.room.conditions import HANGS, conditions
 from service.room.context import now_of
-from service.room.describe_measurement import (
+from service.room.execution import Execution
+from service.room.history import arrival_by_hand, rests_on_slices
+from service.room.link import RoomLink
+from service.room.measurement_view import (
     describe_error,
     describe_measurement,
     describe_other_fiducial,
     describe_reconstruction,
 )
-from service.room.execution import Execution
-from service.room.history import arrival_by_hand, rests_on_slices
-from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
 from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
 from service.room.prompt import is_calibrated, is_punctured, next_action, outcome_text, prompt

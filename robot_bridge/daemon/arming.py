@@ -9,7 +9,7 @@ from robot_bridge.protocol.messages import Code
 from robot_bridge.protocol.phases import WorkPhase
 
 
-class Permission:
+class Arming:
     """A stop stays latched until an operator re-arms."""
 
     def __init__(self, stop: LatchedStop) -> None:

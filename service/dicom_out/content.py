@@ -38,7 +38,7 @@ class Distance:
 
 
 @dataclass(frozen=True, eq=False)
-class Finding:
+class ReportContent:
     """files: of the slices that were measured, in their order; the shown one is `shown`.
 
     must_be_plane_mm: (2,) row and column in the image plane, where the fiducial is to appear;
@@ -89,7 +89,7 @@ class Finding:
         return self.must_be_plane_mm - np.array(self.result["plane_mm"])
 
 
-def finding_of_measurement(record: CaseRecord, measurement_id: int) -> Finding:
+def finding_of_measurement(record: CaseRecord, measurement_id: int) -> ReportContent:
     """Raises CaseRecordError if there is no such measurement, or it found nothing."""
     row = record.measurement(measurement_id)
     case = record.case()
@@ -98,7 +98,7 @@ def finding_of_measurement(record: CaseRecord, measurement_id: int) -> Finding:
     slices = tuple(record.slice(number) for number in row.result["slice_ids"])
     during = _approach_during(record, row)
     must_be = _must_be(record, row, during)
-    return Finding(
+    return ReportContent(
         case_dir=record.case_dir,
         case_uid=case.case_uid,
         case_created_s=case.created_s,
@@ -111,7 +111,7 @@ def finding_of_measurement(record: CaseRecord, measurement_id: int) -> Finding:
     )
 
 
-def finding_of_arrival(record: CaseRecord, procedure_id: int) -> Finding:
+def finding_of_arrival(record: CaseRecord, procedure_id: int) -> ReportContent:
     """READY at the end of an approach. Raises CaseRecordError if that was never said of it."""
     if procedure_id not in arrivals_said_ready(record):
         raise CaseRecordError(f"{record.case_dir}: procedure {procedure_id} did not reach READY")
@@ -127,7 +127,7 @@ def finding_of_arrival(record: CaseRecord, procedure_id: int) -> Finding:
     )
     must_be = _wanted_by(found.measurement, arrival)
     changes = {"distance": distance, "must_be_plane_mm": must_be, "arrival": arrival}
-    return Finding(**{**vars(found), **changes})
+    return ReportContent(**{**vars(found), **changes})
 
 
 def arrivals_said_ready(record: CaseRecord) -> list[int]:
@@ -135,14 +135,14 @@ def arrivals_said_ready(record: CaseRecord) -> list[int]:
     return [int(event.body["procedure_id"]) for event in record.events_of_kind(READY)]
 
 
-def finding_of_puncture(record: CaseRecord, event_id: int) -> Finding:
+def finding_of_puncture(record: CaseRecord, event_id: int) -> ReportContent:
     """A recorded puncture. Raises CaseRecordError if that event is none."""
     known = (event for event in record.events_of_kind("puncture") if event.event_id == event_id)
     puncture = next(known, None)
     if puncture is None:
         raise CaseRecordError(f"{record.case_dir}: event {event_id} is not a puncture")
     found = finding_of_arrival(record, int(puncture.body["procedure_id"]))
-    return Finding(**{**vars(found), "puncture": puncture})
+    return ReportContent(**{**vars(found), "puncture": puncture})
 
 
 def plan_events(record: CaseRecord) -> list[Event]:
