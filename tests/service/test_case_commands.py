@@ -228,7 +228,7 @@ def test_replay_refuses_a_method_that_does_not_exist(case):
     ended = autospine("replay", case, "--method", "magic")
     assert (ended.returncode, ended.stderr.strip()) == (
         2,
-        "autospine: no method 'magic'; known: ml, base, bicubic, sr",
+        "autospine: unknown method 'magic'; known: ml, base, bicubic, sr",
     )
 
 

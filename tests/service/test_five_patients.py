@@ -8,13 +8,14 @@ from __future__ import annotations
 import contextlib
 import io
 import re
+import time
 import zipfile
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pydicom
 import pytest
-from attended_room import AttendedRoom, wait_for
+from attended_room import AttendedRoom, read_off, wait_for
 from browser import laid_out
 from playwright.sync_api import Browser, Page, expect
 from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
@@ -26,6 +27,7 @@ from service.room.state import RoomState
 
 pytestmark = pytest.mark.timeout(1800)
 SLOW_MS = 120_000
+PRESS_S = 180.0
 
 
 class Hospital(AttendedRoom):
@@ -84,7 +86,9 @@ def press(page: Page, client: RoomClient, done: Callable[[RoomState], object], *
 
     As a person does: a button that has just moved takes no click, and a page is drawn anew.
     """
+    deadline_s = time.monotonic() + PRESS_S
     while not done(until(client, lambda s: True)):
+        assert time.monotonic() < deadline_s, f"nothing came of {words}: {client.state().prompt}"
         for word in words:
             button = page.get_by_role("button", name=word, exact=True).first
             if button.is_visible():
@@ -104,6 +108,10 @@ def arm(page: Page, client: RoomClient) -> None:
             return
         if robot.taken_um:
             expect(page.locator("#next")).to_contain_text("Assumed stage positions")
+            # as read off the stages' scales: what the bridge remembers may be too uncertain to
+            # calibrate with, and the page offers nothing but to confirm that
+            client.reset(read_off(client, robot.taken_um))
+            continue
         with contextlib.suppress(PlaywrightTimeoutError):  # the page was drawn anew meanwhile
             offered.click(timeout=2000)
         page.wait_for_timeout(200)

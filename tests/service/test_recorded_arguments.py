@@ -51,7 +51,7 @@ OTHERS = {
     APPROACH: APPROACHED
     | {"confirm_moves", "most_frames", "proven", "strategy", "stop_rule", "seed"}
     | {"systematic_mm"},
-    GUIDE_CALIBRATION: CALIBRATED | {"geometry", "localization"},
+    GUIDE_CALIBRATION: CALIBRATED | {"geometry", "localization", "last", "same_mount"},
     GUIDE_APPROACH: APPROACHED
     | {"confirm_moves", "most_frames", "proven", "geometry", "lower_plane_mm", "systematic_mm"},
 }
