@@ -34,4 +34,5 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
         fixtures = set(getattr(item, "fixturenames", ()))
         if fixtures & _FIXTURES or _starts_processes(item.path):
             item.add_marker("process")
-    items.sort(key=lambda item: not _starts_processes(item.path))
+    with_processes = {item.path for item in items if item.get_closest_marker("process")}
+    items.sort(key=lambda item: item.path not in with_processes)

@@ -158,7 +158,7 @@ def test_between_messages_an_association_may_be_silent_for_longer_than_within_on
         assert store(sock, "1.2.2", encoded(mr_data_set("1.2.2"))) == 0
         assert answer(sock)[0] == ABORTED
         wait_for(lambda: endings(server))
-        assert endings(server) == ["association of 'SCANNER' (127.0.0.1): nothing came for 2 s"]
+        assert endings(server) == ["association of 'SCANNER' (127.0.0.1): nothing arrived for 2 s"]
 
 
 @pytest.mark.parametrize(
@@ -183,7 +183,7 @@ def test_a_message_that_cannot_be_read_ends_the_association_with_a_line(tmp_path
         sock.sendall(p_data(3, store_command("")) + p_data(2, b"\x10\0\x10\0LO\2\0ab"))
         assert answer(sock)[0] == ABORTED
         wait_for(lambda: endings(server))
-        assert "cannot be read: a C-STORE without a SOP Instance UID" in endings(server)[0]
+        assert "an unreadable message: a C-STORE without a SOP Instance UID" in endings(server)[0]
 
 
 def test_no_more_contexts_than_there_are_make_a_request():
