@@ -199,7 +199,7 @@ class Bridge:
         """Deadman, begin of an accepted motion, progress of a running one. Call often."""
         now_s = self._clock()
         stalled_s, self._ticked_s = now_s - self._ticked_s, now_s
-        if self.armed or self.moving:
+        if self.armed or self._motion.goes_on:
             if stalled_s > self.settings.deadman_s:
                 self.stop_for(Code.LOOP_STALLED, f"the bridge stalled for {stalled_s:.1f} s")
             elif now_s - self._fresh_s > self.settings.deadman_s:

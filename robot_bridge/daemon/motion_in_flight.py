@@ -63,6 +63,11 @@ class MotionInFlight:
         """The command whose motion has not ended."""
         return self._motion.record if self._motion else None
 
+    @property
+    def goes_on(self) -> bool:
+        """A motion is in flight, and nothing has ended it yet."""
+        return self._motion is not None and self._motion.ending is None
+
     # --- the position -------------------------------------------------------------------------
 
     @property
@@ -107,11 +112,12 @@ class MotionInFlight:
         self, positions_um: Mapping[str, int], within_um: Mapping[str, int]
     ) -> None:
         """Only what is named is declared. Raises MotorError, JournalError."""
+        were_certain = self.certain_axes
         self._motors.motors.declare_position(positions_um)
         self._certain |= frozenset(positions_um)
         self._declared += 1
         self.last_motion = f"declared:{self._boot_id}:{self._declared}"
-        self.whereabouts.declared(positions_um, within_um)
+        self.whereabouts.declared(positions_um, within_um, were_certain)
         self._motors.poll()
         self._journal.keep_stands(self.whereabouts.stands)
 

@@ -95,13 +95,25 @@ class Whereabouts:
     def growth_of(self, axis: str) -> Growth:
         return self.growth.get(axis, Growth())
 
-    def declared(self, positions_um: Mapping[str, int], within_um: Mapping[str, int]) -> None:
-        """An axis that is declared where it was only guessed to be is known no better by that."""
+    def declared(
+        self,
+        positions_um: Mapping[str, int],
+        within_um: Mapping[str, int],
+        were_certain: Collection[str] = (),
+    ) -> None:
+        """An axis that is declared where it was only guessed to be is known no better by that.
+
+        were_certain: nobody was asked to confirm a guess of these; they were measured.
+        """
         for axis, at_um in positions_um.items():
             guess = self.stands.get(axis)
             if axis in within_um:
                 stand = Stand(at_um, float(within_um[axis]))
-            elif guess and abs(guess.true_um - at_um) <= self.growth_of(axis).tolerance_um:
+            elif (
+                guess
+                and axis not in were_certain
+                and abs(guess.true_um - at_um) <= self.growth_of(axis).tolerance_um
+            ):
                 stand = replace(guess, at_um=at_um, correction_um=0)
             else:
                 stand = Stand(at_um)

@@ -56,7 +56,15 @@ def initialise(c: PmdController) -> Steps[None]:
 
 
 def verify(c: PmdController) -> Steps[None]:
-    """Before a move: the board still has the settings that it was given. Raises PmdError."""
+    """Before a move: it is the axis's own board, with the settings that it was given.
+
+    Cables can change places behind an adapter that never drops out. Raises PmdError.
+    """
+    if c.board and (yield from c.ask("Y42")).integer() != int(c.board):
+        board = yield from _serial_number(c)  # it may have been the line
+        c.needs_setup = board != c.board
+        c.certain = c.certain and not c.needs_setup
+        _check_board(c, board)
     if not c.settings:
         return
     differing = yield from _differing(c)
@@ -80,6 +88,12 @@ def _identify(c: PmdController) -> Steps[None]:
     if reply and model not in MODELS:
         raise c.error("unknown_controller", f"identifies as '{c.identity}'")
     board = yield from _serial_number(c)
+    _check_board(c, board)
+    c.board = board
+
+
+def _check_board(c: PmdController, board: str) -> None:
+    """Raises AxisFaultError."""
     wanted = c.config.serial_number
     known = str(wanted) if wanted else c.board
     if known and board != known:
@@ -88,7 +102,6 @@ def _identify(c: PmdController) -> Steps[None]:
             f"board {board or 'without a serial number'} answers on {c.config.controller} where "
             f"board {known} belongs: two boards were swapped, or one was replaced",
         )
-    c.board = board
 
 
 def _serial_number(c: PmdController) -> Steps[str]:

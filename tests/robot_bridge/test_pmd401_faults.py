@@ -453,6 +453,20 @@ def test_an_axis_that_should_stay_is_not_commanded():
             assert made.position_um(2) == pytest.approx(-300, abs=1)
 
 
+def test_cables_that_change_places_without_a_drop_out_move_nothing():
+    """Both boards have address 1, and the adapters never notice."""
+    with rig(motor=Motor(serial_number=1)) as made, opened(made) as motors:
+        with made.lock:
+            made.controller(1).motor = Motor(serial_number=2)
+        motors.move_to({"xt": 1000, "yt": 0})
+        status = finish(motors)
+        assert status.fault == "wrong_board"
+        assert "board 2 answers" in status.fault_text
+        nothing_moves(made)
+        assert made.position_um(1) == 0
+        assert "xt" not in motors.poll().certain_axes
+
+
 def test_two_boards_that_come_back_under_each_others_names_move_nothing(tmp_path):
     """The serial number says which axis a board drives, not the name of its port."""
 

@@ -139,3 +139,11 @@ def test_an_axis_that_stays_is_known_no_worse():
     known.arrived({"xt": 500}, ["xt"], {})
     assert known.stands["xt"] == Stand(500, 10.0)
     assert known.reach_um("xt", 500) == (490, 510)
+
+
+def test_measuring_an_axis_that_is_certain_clears_its_bound_and_confirming_a_guess_does_not():
+    known = Whereabouts({"xt": COUNTED}, {"xt": Stand(500, known_to_um=7000)})
+    known.declared({"xt": 505}, {})
+    assert known.stands["xt"].bound_um == 7000  # that was the guess, repeated
+    known.declared({"xt": 505}, {}, were_certain={"xt"})
+    assert known.stands["xt"].bound_um == 0
