@@ -179,7 +179,7 @@ def test_a_slice_is_offered_for_its_own_hold_only_and_a_reason_is_asked_for(
         expect(offers).to_have_count(1)
         expect(offers).to_have_text(f"Use at hold {here.hold_id}")
         offers.click()
-        page.get_by_label("Why is it of this hold?").fill("seen on the console")
+        page.get_by_label("Why does it belong to this hold?").fill("seen on the console")
         page.get_by_role("button", name=f"Use at hold {here.hold_id}").click()
         used = wait_for(lambda: client.slice(late), lambda s: s.state == "assigned")
         assert used.hold_id == here.hold_id
