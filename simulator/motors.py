@@ -50,7 +50,6 @@ from simulator.motion_truth import COMMANDED, MotionTruth
 from simulator.stage_physics import PiezoLegsStage, StageParameters
 
 STANDSTILL_S = 0.05
-PARENT_CHECK_S = 0.25
 
 
 class StateFileError(ValueError):

@@ -61,11 +61,6 @@ def disc_spectrum(k_abs: Array, radius_px: float) -> Array:
     return np.asarray(radius_px * j1(2 * np.pi * radius_px * k) / k)
 
 
-def disc_spectrum_by_radius(k_abs: Array, radius_px: float) -> Array:
-    """Derivative of `disc_spectrum` with respect to the radius."""
-    return np.asarray(2 * np.pi * radius_px * j0(2 * np.pi * radius_px * k_abs))
-
-
 def sphere_slab_spectrum(
     k_abs: Array, radius_px: float, slab_px: tuple[float, float], nodes: int = 24
 ) -> Array:

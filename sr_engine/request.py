@@ -1,4 +1,4 @@
-"""A requested measurement, from its slices to what the record keeps of it. No I/O here.
+"""A requested measurement: its slices, their point spread, and the fit. No I/O here.
 
 The one policy of localization: what steers, what is replayed, and what the studies count is asked
 for and answered here. Beside the engine's numerics it knows slices as the record describes them.
@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, cast, get_args
 
 import numpy as np
@@ -34,11 +34,11 @@ from sr_engine.localize import SEARCH_PX, localize
 from sr_engine.paper import PaperMethod, PaperSettings, localize_paper
 from sr_engine.psf import Psf
 from sr_engine.recognise import psf_of_noise
+from sr_engine.result import TEMPLATE, Found, plane_mm
 from sr_engine.template.outline import SIGMA_PX, compact_object
 from sr_engine.template.poses import localize_by_template
 from sr_engine.views import SAME_SLICE_MM, Frames, Learnt, Templates, View, why_unlike
 
-TEMPLATE = "template"
 _SAME_PLACE = 1e-6
 _BUT_NO_DISC = (NoRoundObjectError, NotConvergedError, InconsistentFramesError)
 log = structlog.get_logger()
@@ -50,18 +50,6 @@ class UnusableSlicesError(Exception):
     def __init__(self, code: str, text: str) -> None:
         super().__init__(text)
         self.code = code
-
-
-@dataclass(frozen=True, eq=False)
-class Found:
-    """A localization, and what it rests on.
-
-    learnt: the template, where it is one's; why_not: why it is not, though one was asked for.
-    """
-
-    by: Localization
-    learnt: Learnt | None = None
-    why_not: str = ""
 
 
 class PointSpreads:
@@ -85,14 +73,6 @@ class PointSpreads:
         return self._recognised[key]
 
 
-def recorded_point_spread(result: Mapping[str, Any] | None) -> Psf | None:
-    """What a recorded measurement was made with; None where its record does not say."""
-    recorded = (result or {}).get("point_spread")
-    if recorded is None:
-        return None
-    return Psf(recorded["kind"], tuple(recorded["parameters"]), tuple(recorded["acquired"]))
-
-
 def is_at_position(row: SliceRow, slice_position_mm: float | None) -> bool:
     """True if the middle of the slice is there along its normal; None is everywhere."""
     if slice_position_mm is None:
@@ -111,72 +91,6 @@ def geometry_of(header: Mapping[str, Any]) -> SliceGeometry:
         spacing_mm=tuple(geometry["spacing_mm"]),
         shape=tuple(geometry["shape"]),
     )
-
-
-def describe_result(frames: Frames, answer: Found) -> dict[str, Any]:
-    """Return what the record keeps of a localization, JSON-ready; see `case_record.rows`."""
-    geometry, found = frames.geometry, answer.by
-    spacing = np.array(geometry.spacing_mm)
-    covariance = np.asarray(found.covariance_px2)
-    centre = np.asarray(found.centre_px)
-    # the newest slice is what the page shows: say where the fiducial is in that one
-    shown_px = centre + frames.shifts_px[-1]
-    return {
-        "slice_id": frames.slices[-1].slice_id,
-        "slice_ids": [row.slice_id for row in frames.slices],
-        "centre_px": shown_px.tolist(),
-        "reference_px": centre.tolist(),
-        "sigma_px": np.sqrt(np.diag(covariance)).tolist(),
-        "covariance_px2": covariance.tolist(),
-        "radius_px": float(found.radius_px),
-        "snr": float(found.snr),
-        "chi2_per_dof": float(found.chi2_per_dof),
-        "residuals_px": np.asarray(found.residuals_px).tolist(),
-        "method": found.method,
-        "n_frames": int(found.n_frames),
-        "patient_mm": geometry.patient_from_pixel(centre).tolist(),
-        "plane_mm": _plane_mm(geometry, centre).tolist(),
-        "covariance_mm2": (covariance * np.outer(spacing, spacing)).tolist(),
-        "plane": {
-            "row_direction": list(geometry.row_direction),
-            "col_direction": list(geometry.col_direction),
-            "spacing_mm": list(geometry.spacing_mm),
-        },
-        "scan_s": sum(_scan_s(row.header) for row in frames.slices),
-        **_common_part(found, spacing),
-        **({} if answer.learnt is None else {TEMPLATE: _described(answer.learnt)}),
-        **({} if not answer.why_not else {"why_no_template": answer.why_not}),
-    }
-
-
-def _common_part(found: Localization, spacing_mm: NDArray[np.float64]) -> dict[str, Any]:
-    """What is common to all places found so, std mm (row, col): see `Localization`."""
-    if found.systematic_px is None:
-        return {}
-    return {"systematic_mm": (np.asarray(found.systematic_px) * spacing_mm).tolist()}
-
-
-def _described(learnt: Learnt) -> dict[str, Any]:
-    """A template, by the slices that it was learnt from, and where it finds the fiducial there."""
-    spacing = np.array(learnt.views[0].frames.geometry.spacing_mm)
-    places = [
-        {
-            "measurement_id": view.measurement_id,
-            "slice_ids": [row.slice_id for row in view.frames.slices],
-            "plane_mm": _plane_mm(view.frames.geometry, np.asarray(place.centre_px)).tolist(),
-            "covariance_mm2": (place.covariance_px2 * np.outer(spacing, spacing)).tolist(),
-        }
-        for view, place in zip(learnt.views, learnt.places, strict=True)
-    ]
-    own = np.sqrt(np.diag(learnt.template.common_px2)) * spacing
-    return {"frames": learnt.template.n_frames, "sigma_mm": own.tolist(), "views": places}
-
-
-def _scan_s(header: Mapping[str, Any]) -> float:
-    """How long the scanner took for this slice, by its own clock; 0 where it does not say."""
-    interval = header.get("interval") or {}
-    start_s, end_s = interval.get("start_s"), interval.get("end_s")
-    return 0.0 if start_s is None or end_s is None else float(end_s - start_s)
 
 
 def localize_request(
@@ -265,7 +179,7 @@ def _found_by_template(frames: Frames, request: Mapping[str, Any], learnt: Learn
 
 def _expected_px(frames: Frames, request: Mapping[str, Any]) -> NDArray[np.float64]:
     expected_mm = np.array(request["expected_plane_mm"])
-    origin_mm = _plane_mm(frames.geometry, np.zeros(2))
+    origin_mm = plane_mm(frames.geometry, np.zeros(2))
     return np.asarray((expected_mm - origin_mm) / np.array(frames.geometry.spacing_mm))
 
 
@@ -419,13 +333,6 @@ def _whole_pixels(
             f"outside of the {rows} x {cols} slice"
         )
     return r0, c0, r1, c1
-
-
-def _plane_mm(geometry: SliceGeometry, pixel: NDArray[np.float64]) -> NDArray[np.float64]:
-    """A pixel (row, col) in the image plane, mm from the patient's origin."""
-    position = np.array(geometry.position_mm)
-    origin_mm = np.array([position @ geometry.row_direction, position @ geometry.col_direction])
-    return np.asarray(origin_mm + pixel * np.array(geometry.spacing_mm))
 
 
 def common_geometry(slices: list[SliceRow]) -> SliceGeometry:

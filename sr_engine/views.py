@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from case_record.rows import SliceRow
 from dicom_slice.geometry import SliceGeometry
+from dicom_slice.protocol import other_protocol
 from sr_engine.errors import EngineError, TemplateError
 from sr_engine.localization import Localization
 from sr_engine.localize import combined
@@ -26,11 +27,6 @@ SAME_SLICE_MM = 0.5
 _CAMERA = "camera"
 _SAME_DIRECTION = 1e-3
 _SAME_SHARE = 1e-3
-_PROTOCOL = {
-    "pixel_bandwidth_hz": "pixel bandwidth",
-    "imaging_frequency_mhz": "imaging frequency",
-    "phase_encoding_direction": "phase encoding direction",
-}
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,22 +71,12 @@ def why_unlike(one: Frames, other: Frames) -> str:
     apart_mm = float(a.normal @ (np.array(b.position_mm) - np.array(a.position_mm)))
     if not abs(apart_mm) <= SAME_SLICE_MM:
         return f"a place {apart_mm:+.1f} mm along the slice normal"
-    for key, name in _PROTOCOL.items():
-        mine, others = (frames.slices[0].header.get(key) for frames in (one, other))
-        if not _same(mine, others):
-            return f"another {name} ({others} instead of {mine})"
-    return ""
+    return other_protocol(one.slices[0].header, other.slices[0].header)
 
 
 def _size(geometry: SliceGeometry) -> str:
     (rows, cols), (row_mm, col_mm) = geometry.shape, geometry.spacing_mm
     return f"{rows} x {cols} of {row_mm:g} x {col_mm:g} mm"
-
-
-def _same(mine: object, others: object) -> bool:
-    if isinstance(mine, int | float) and isinstance(others, int | float):
-        return abs(mine - others) <= _SAME_SHARE * abs(mine)
-    return mine == others
 
 
 class Templates:

@@ -33,15 +33,13 @@ from sr_engine.errors import EngineError, SingularShiftSetError, TemplateError
 from sr_engine.psf import Psf
 from sr_engine.reconstruction.reconstruct import reconstruct
 from sr_engine.request import (
-    TEMPLATE,
-    Found,
     PointSpreads,
     UnusableSlicesError,
     common_geometry,
-    describe_result,
     is_at_position,
     localize_request,
 )
+from sr_engine.result import TEMPLATE, Found, describe_result
 from sr_engine.views import Frames, Templates, View
 
 IMAGES = "images"

@@ -41,7 +41,8 @@ from simulator.scene import true_fiducial_mm
 from simulator.stage_physics import PiezoLegsStage, StageParameters
 from sr_engine.errors import EngineError
 from sr_engine.psf import Psf
-from sr_engine.request import describe_result, localize_request
+from sr_engine.request import localize_request
+from sr_engine.result import describe_result
 from sr_engine.views import Frames, Templates, View
 
 Array = NDArray[np.float64]

@@ -26,7 +26,8 @@ from service.procedure.registry import build_procedure
 from service.procedure.runner import ReplayMismatchError, same_step
 from service.procedure.steps import outcome_from_json
 from sr_engine.errors import EngineError
-from sr_engine.request import UnusableSlicesError, describe_result, recorded_point_spread
+from sr_engine.request import UnusableSlicesError
+from sr_engine.result import describe_result, recorded_point_spread
 from sr_engine.worker import Known, frames_then, gather_frames, localize_as_asked
 
 app = typer.Typer(add_completion=False)

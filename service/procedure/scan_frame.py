@@ -14,10 +14,10 @@ from typing import Any
 from case_record.record import CaseRecord
 from case_record.rows import Measurement
 from dicom_listener.belonging import ACCEPTED, BOUND, HELD, SAME_PATIENT, after_event
+from dicom_slice.protocol import other_protocol
 from dicom_slice.reasons import Reason
 
 CASE_REOPENED = "case_reopened"
-_SAME_SHARE = 1e-3
 
 
 @dataclass(frozen=True)
@@ -54,22 +54,7 @@ class ScanFrame:
 
     def other_protocol(self, other: ScanFrame) -> str:
         """What shows oil elsewhere beside water in the other's slices; empty if nothing does."""
-        for name, mine, others in (
-            ("pixel bandwidth", self.pixel_bandwidth_hz, other.pixel_bandwidth_hz),
-            ("imaging frequency", self.imaging_frequency_mhz, other.imaging_frequency_mhz),
-        ):
-            if mine is None or others is None:
-                if mine is not others:
-                    return f"a {name} where the others have none"
-            elif not abs(mine - others) <= _SAME_SHARE * abs(mine):
-                return f"a different {name} ({others:g} instead of {mine:g})"
-        if self.phase_encoding_direction != other.phase_encoding_direction:
-            return (
-                "a different phase encoding direction "
-                f"({other.phase_encoding_direction or 'unknown'} "
-                f"instead of {self.phase_encoding_direction or 'unknown'})"
-            )
-        return ""
+        return other_protocol(self.to_json(), other.to_json())
 
 
 STUDY_ACCEPTED = "study_accepted"

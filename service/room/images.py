@@ -17,8 +17,8 @@ from case_record.record import CaseRecord
 from case_record.seals import TamperedError
 from dicom_slice.pixels import magnitude_pixels
 from dicom_slice.reasons import Reason, UnusableError
-from sr_engine.request import recorded_point_spread
 from sr_engine.residual import residual_image
+from sr_engine.result import recorded_point_spread
 
 _MOST_SIDE_PX = 4096
 _WINDOW_PERCENT = (1.0, 99.8)

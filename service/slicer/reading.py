@@ -22,7 +22,6 @@ from service.slicer.messages import (
     META_ENTRY,
     POINT_BYTES,
     POINT_HEAD,
-    STATUS_HEAD,
     STRING_HEAD,
     TO_RAS,
     crc64,
@@ -209,12 +208,6 @@ def points_of(message: Received) -> list[ReceivedPoint]:
         x, y, z = (float(value) for value in place)
         found.append(ReceivedPoint(_text(name), _text(group), (x, y, z)))
     return found
-
-
-def status_code_of(message: Received) -> int:
-    if len(message.content) < STATUS_HEAD.size:
-        raise MessageError("a STATUS without a code")
-    return int(STATUS_HEAD.unpack_from(message.content)[0])
 
 
 def _text(field_bytes: bytes) -> str:

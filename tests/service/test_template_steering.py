@@ -117,7 +117,7 @@ def test_slices_of_another_protocol_are_not_fitted_by_it_and_said_to_be(recorded
     )
     assert seen.method == "ml"
     result = recorded.record.last_measurement("done").result
-    assert "another pixel bandwidth (130.0 instead of 260.0)" in result["why_no_template"]
+    assert "a different pixel bandwidth (130 instead of 260)" in result["why_no_template"]
     assert "calibrate again" in result["why_no_template"]
     # what disc and template mean by the middle may differ: that is in its covariance
     assert np.all(np.diag(seen.covariance_mm2) > np.square(start.found_by.systematic_mm))
