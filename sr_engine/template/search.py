@@ -6,7 +6,6 @@ from scipy.ndimage import maximum_filter
 from scipy.signal import oaconvolve
 
 from sr_engine.errors import AmbiguousObjectError, NoRoundObjectError
-from sr_engine.noise import moments
 from sr_engine.template.fit import Metric
 from sr_engine.template.image import ObjectImage
 
@@ -29,7 +28,7 @@ def find_object(
     """
     mask = metric.mask
     n = int(mask.sum())
-    model = np.where(mask, moments(image.at(np.zeros(2))[0], metric.sigma, metric.kind).mean, 0.0)
+    model = np.where(mask, metric.expected(image.at(np.zeros(2))[0]).mean, 0.0)
     model = np.where(mask, model - model[mask].mean(), 0.0)
     model /= np.linalg.norm(model)
     size = len(mask)
