@@ -68,7 +68,7 @@ class Lags:
 
     @cached_property
     def pairs(self) -> Array:
-        return np.maximum(self._sums(self.mask[None], self.mask[None]), 1.0)
+        return np.maximum(self._sums(*[self.mask[None].astype(np.float64)] * 2), 1.0)
 
     def mean(self, first: Array, second: Array) -> Array:
         """Mean product of pixels of first (M, rows, cols) with those of second, at each lag."""

@@ -82,7 +82,7 @@ class Metric:
         """(p,) rows and columns of the pixels that count, from the middle of the patch."""
         row, col = np.nonzero(self.mask)
         middle = len(self.mask) // 2
-        return row - float(middle), col - float(middle)
+        return row.astype(np.float64) - middle, col.astype(np.float64) - middle
 
     @cached_property
     def used(self) -> NDArray[np.intp]:

@@ -197,7 +197,7 @@ class _Average:
 @lru_cache(maxsize=8)
 def _axes(n: int) -> tuple[Complex, Array]:
     """2 pi i times the frequencies, and the pixels from the middle."""
-    return 2j * np.pi * np.fft.fftfreq(n), np.arange(n, dtype=float) - n // 2
+    return np.asarray(2j * np.pi * np.fft.fftfreq(n)), np.arange(n, dtype=np.float64) - n // 2
 
 
 @lru_cache(maxsize=8)
@@ -206,7 +206,8 @@ def _annuli(n: int) -> tuple[NDArray[np.int_], Array, Array]:
     k = np.abs(np.fft.fftfreq(n, 1 / n))
     away = np.hypot(k[:, None], k[None, :])
     annuli = np.rint(away).astype(int)
-    return annuli, np.bincount(annuli.ravel()), _radial_basis(away.ravel())
+    counts = np.bincount(annuli.ravel()).astype(np.float64)
+    return annuli, counts, _radial_basis(away.ravel())
 
 
 def _radial_basis(k: Array) -> Array:

@@ -251,7 +251,7 @@ def _learnt(seen: _Seen, channels: float | None) -> _Learnt:
         sigma = float(np.sqrt(seen.air_power / (2 * channels)))
         views = replace(views, sigma=max(sigma, 1e-6 * float(np.ptp(patches)), 1e-12))
     metric = Metric.white(seen.mask, views.sigma, channels)
-    start = None
+    start: NDArray[np.complex128] | None = None
     for _ in range(_ROUNDS):
         if channels is None:
             averaged = averaged_image(replace(views, patches=patches - surroundings))
@@ -291,8 +291,8 @@ def _measured(metric: Metric, left: Array, shown: Array, extra: float) -> Metric
     standard[:, mask] = left[:, mask] / np.sqrt(metric.expected(pixels).variance)
     taken = taken_by_fit(pixels.mean(axis=0), metric)
     lost, table, error = lag_correlation(standard, Lags(mask, LAGS_PX), taken)
-    table = believed(table, error)
-    colour = None if table is None else Colour.of_lags(table, len(mask))
+    lags = believed(table, error)
+    colour = None if lags is None else Colour.of_lags(lags, len(mask))
     return replace(metric, scales=scales * lost, colour=colour)
 
 
