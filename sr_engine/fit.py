@@ -39,6 +39,7 @@ Array = NDArray[np.float64]
 
 OUTLIER_SIGMA = 4.5
 _MIRRORED_SHARE = 0.4  # of an odd pixel, at its mirror image: then it is the outline
+_THINNEST_RING_PX = 1.0  # a brighter rim is no ring
 _NEIGHBOUR_SHARE = 0.55  # of that, for the neighbours of a pixel left out
 _MAX_ITERATIONS = 120  # a filtered magnitude can hold the fit at a saddle for forty
 _LONGEST_STEP_PX = 0.7  # of centre and radius
@@ -89,10 +90,15 @@ class DiscFit:
         return float(self.parameters[WALL_PX]) if self.parameters.size > WALL else 0.0
 
     @property
+    def is_ring(self) -> bool:
+        """About a void: its wall is resolved, and stands out twice as much as what it encloses."""
+        is_wall = self.wall_px >= _THINNEST_RING_PX
+        return is_wall and bool(abs(self.parameters[WALL]) > 2 * abs(self.amplitude))
+
+    @property
     def outer_px(self) -> float:
         """Radius of the outer edge of a ring about a void; else the object's own."""
-        is_ring = self.wall_px > 0 and abs(self.parameters[WALL]) > 2 * abs(self.amplitude)
-        return self.radius_px + (self.wall_px if is_ring else 0.0)
+        return self.radius_px + (self.wall_px if self.is_ring else 0.0)
 
     @property
     def snr(self) -> float:

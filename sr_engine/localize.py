@@ -131,7 +131,8 @@ def localize(
         if fit.n_masked > np.count_nonzero(~pixels.mask):
             whole = _without_mask(pixels, fit, how)
             fit = fit if whole is None else _widened_by_mask(fit, whole)
-        fit = with_lopsidedness(fit, pixels, level)
+        if not psf.folds:  # what a camera folds differs from pixel to pixel, and draws no edge
+            fit = with_lopsidedness(fit, pixels, level)
         _refuse_doubtful(fit, begin, frame.shape)
         fits.append(fit)
         guess = (*(fit.centre_px - shift), fit.outer_px)
@@ -182,7 +183,7 @@ def _disc_or_ring(
         except (NoRoundObjectError, NotConvergedError):
             continue
         outer = fit.radius_px + fit.wall_px
-        is_like = how.bounds_px[0] < outer < how.bounds_px[1]
+        is_like = fit.is_ring and how.bounds_px[0] < outer < how.bounds_px[1]
         if is_like and (best is None or fit.sigma < best[1].sigma):
             best = ring, fit
     if best is not None and (disc is None or best[1].sigma < RING_GAIN * disc.sigma):
