@@ -24,14 +24,13 @@ from playwright.sync_api import Page, expect
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "service"))
 
 from attended_room import AttendedRoom, arm, running_room, wait_for
-from browser import laid_out, running_browser, set_theme
-from page_states import SIZES, confirm_until_ready, layout_faults, states
+from browser import running_browser, set_theme
+from page_states import SIZES, THEMES, confirm_until_ready, layout_faults, states
 
 from service.client import RoomClient
 
 HERE = Path(__file__).parent / "pictures"
 SIZE = {"width": 1280, "height": 800}
-THEMES = ("dark", "light")
 _SETTLE_MS = 900
 _ANIMATION_S = 30.0
 _FRAME_S = 0.25
@@ -75,6 +74,10 @@ def take_states(folder: Path) -> None:
     taken = 0
     with looking_at_a_room("phantom") as (page, room, client):
         client.describe_case("Facet joint L4/5 left", "Olga Petersen", "phantom")
+        room.power_cycle_controllers()
+        expect(page.locator("#stand")).to_be_visible()
+        page.locator("#stand-yt").fill("99")
+        taken += take_sizes(page, folder, "positions")
         for state in states(page, client):
             taken += take_sizes(page, folder, state)
         room.kill("service")
@@ -91,11 +94,10 @@ def take_states(folder: Path) -> None:
 def take_sizes(page: Page, folder: Path, state: str) -> int:
     for width, height in SIZES:
         page.set_viewport_size({"width": width, "height": height})
-        for fault in layout_faults(page):
-            print(f"{state} {width}x{height}: {fault}")
         for theme in THEMES:
             set_theme(page, theme)
-            laid_out(page)
+            for fault in layout_faults(page):
+                print(f"{state} {width}x{height} {theme}: {fault}")
             page.screenshot(path=folder / f"{state}-{width}x{height}-{theme}.png")
     set_theme(page, "dark")
     return len(SIZES) * len(THEMES)

@@ -18,6 +18,7 @@ from pynetdicom.sop_class import (
     Comprehensive3DSRStorage,
     GrayscaleSoftcopyPresentationStateStorage,
     MRImageStorage,
+    SpatialFiducialsStorage,
 )
 
 from dicom_listener.association_fix import mended
@@ -27,6 +28,7 @@ _SOP_CLASSES = (
     MRImageStorage,
     Comprehensive3DSRStorage,
     GrayscaleSoftcopyPresentationStateStorage,
+    SpatialFiducialsStorage,
 )
 _TRANSFER_SYNTAXES = [ExplicitVRLittleEndian, ImplicitVRLittleEndian]
 _DUPLICATE = 0x0111

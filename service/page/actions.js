@@ -1,6 +1,7 @@
 // What the operator does next: the prompt in words, the open question, and the possible actions.
 
 import { order } from "./api.js";
+import { StandForm } from "./arming.js";
 import { byId, h, replace, setText, whenChanged } from "./dom.js";
 import { mm } from "./format.js";
 import { planTable } from "./plan_table.js";
@@ -12,6 +13,10 @@ const { next: words, chips } = TEXTS;
 const READ_FIRST_MS = 700;
 
 const post = (path, body) => () => order("POST", `api/v1/${path}`, body);
+
+// Arming says where the stages stand, where they lost count of it.
+const asksWhere = (action, robot) => action.code === "reset" && Object.keys(robot.taken_um ?? {}).length > 0;
+const keyOf = (robot) => (action) => [action.label, asksWhere(action, robot) ? [robot.taken_um, robot.taken_from] : null];
 
 // Which actions make sense now. Green is only what the prompt asks for.
 export function actionsFor(state) {
@@ -25,9 +30,7 @@ export function actionsFor(state) {
     add("needle-out", words.needleOut, "needle-out", robot.linked && robot.insertion_locked);
     return list;
   }
-  const stands = Object.keys(robot.taken_um ?? {}).length > 0;
-  const arm = robot.stopped ? words.rearm : words.arm;
-  add("reset", stands ? words.standThere(arm) : arm, post("reset", stands ? { positions_um: robot.taken_um } : {}),
+  add("reset", robot.stopped ? words.rearm : words.arm, post("reset"),
     robot.linked && !robot.moving && (robot.stopped || !robot.armed || !robot.position_certain));
   add("puncture", words.puncture, "puncture", state.ready && robot.insertion_locked && !state.punctured);
   const planned = state.target_patient_mm && (!state.guide || state.entry_patient_mm);
@@ -60,6 +63,7 @@ export class Next {
     this.onPick = onPick;
     this.drawActions = whenChanged((key, state) => this.actions(state));
     this.drawQuestion = whenChanged((question, state) => this.question(question, state));
+    this.standForm = new StandForm(act);
     this.mayAct = true;
   }
 
@@ -74,17 +78,23 @@ export class Next {
     setText(byId("said"), state.punctured ? words.punctured : "");
     forgetOldRefusal(state);
     this.drawQuestion(state.question, state);
-    this.drawActions([role, actionsFor(state).map((action) => action.label), state.question?.question_id, state.next_action], state);
+    this.drawActions([role, actionsFor(state).map(keyOf(state.robot)), state.question?.question_id, state.next_action], state);
   }
 
   actions(state) {
     const list = state.question ? actionsFor(state).filter((a) => a.label === words.abort) : actionsFor(state);
-    replace(byId("actions"), list.map((action) => h("button", {
+    replace(byId("actions"), list.map((action) => this.action(action, state)));
+  }
+
+  action({ code, label, run }, state) {
+    const isMain = code === state.next_action;
+    if (asksWhere({ code }, state.robot)) return this.standForm.draw(state.robot, label, isMain, this.mayAct);
+    return h("button", {
       type: "button", disabled: !this.mayAct,
-      class: [action.code === state.next_action ? "main" : "", action.code === "needle-out" ? "apart" : ""].join(" ").trim() || null,
+      class: [isMain ? "main" : "", code === "needle-out" ? "apart" : ""].join(" ").trim() || null,
       title: this.mayAct ? null : words.viewersOnly,
-      onclick: () => this.run(action.run),
-    }, action.label)));
+      onclick: () => this.run(run),
+    }, label);
   }
 
   run(what) {
@@ -156,8 +166,6 @@ function moreOf(state) {
   const wanted = state.acquisition_request;
   const place = state.belief?.hold;
   if (wanted) return words.hold(wanted.hold_id, place?.place ?? 1, place?.of ?? 1, wanted.count);
-  const taken = Object.entries(state.robot.taken_um ?? {}).map(([axis, um]) => `${axis} ${mm(um / 1000, 3)} mm`);
-  if (taken.length) return words.taken(taken.join(", "), state.robot.taken_from);
   if (state.procedure) return words.running(TEXTS.procedures[state.procedure] ?? state.procedure.replaceAll("_", " "));
   return state.last_outcome ? words.last(state.last_outcome.replace(/^\w+/, (name) => TEXTS.procedures[name] ?? name)) : "";
 }

@@ -33,7 +33,7 @@ export const TEXTS = {
     hold: (hold, place, of, wanted) => `Robot position ${of > 1 ? `${place} of ${of} of this shift set (hold ${hold})` : `hold ${hold}`}. ${many(wanted, "more slice")} needed here.`,
     confirm: (mm) => `Confirm the move of ${mm} mm?`,
     confirmButton: "CONFIRM MOVE", rejectButton: "Reject", cancel: "Cancel",
-    arm: "Arm the robot", rearm: "Re-arm the robot", taken: (places, from) => `Assumed stage positions: ${places} (${from}).`, standThere: (arm) => `They are there: ${arm.toLowerCase()}`,
+    arm: "Arm the robot", rearm: "Re-arm the robot",
     needleOut: "Needle withdrawn – unlock motion",
     puncture: "Record the puncture", depth: "Insertion depth, mm (optional)", punctured: "Puncture recorded.",
     approach: "Start the approach", pick: "Pick the target on the slice", calibrate: "Start the calibration", targetHere: "Set the target to where the fiducial is now",
@@ -44,6 +44,12 @@ export const TEXTS = {
     drives: (axis, stops) => `${axis}: ${stops} mm`,
     drivesWhy: "The calibration drives the stages without asking again:",
     drivesSure: "Drive the stages – calibrate",
+  },
+  stand: {
+    heading: "Assumed stage positions", from: (source) => `From: ${source}. Read each stage's scale and correct what differs.`,
+    field: (axis) => `Position of ${axis}, mm`, unit: "mm", assumed: (mm) => `mm (assumed: ${mm})`,
+    notNumber: "type a position in mm.", outside: (low, high) => `outside its travel, ${low} to ${high} mm.`,
+    confirm: (arm) => `Positions are right: ${arm.toLowerCase()}`,
   },
   chips: {
     stopped: "Stopped", armed: "Armed", notArmed: "Not armed", moving: "Moving", still: "Standing still",

@@ -13,7 +13,6 @@ from service.procedure.targets import current_entry, current_target, why_void_ta
 from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.present import Readiness
-from service.room.robot.whereabouts import in_words, taken_to_stand
 
 
 def prompt(
@@ -39,7 +38,7 @@ def _idle_prompt(
     if status.phase is WorkPhase.EMERGENCY:
         return "EMERGENCY: drives parked. Attend to the patient and the needle, then re-arm."
     if not status.position_certain and not status.moving:
-        return f"{in_words(taken_to_stand(status))} Check the robot, then confirm them."
+        return "Check where the stages stand, then confirm their positions."
     if status.stopped:
         return f"Stopped ({plain_words(status.stop_reason)}). Re-arm to continue."
     if found is not None:

@@ -60,6 +60,14 @@ class AttendedRoom(DemoRoom):
         here = ["--config", str(self.folder / "room.toml")]
         self.family.launch("bridge", [sys.executable, "-m", "robot_bridge", *here])
 
+    def power_cycle_controllers(self) -> None:
+        """They count from zero again; the stages stand where they stood."""
+        self.kill("bridge")
+        self.kill("motors")
+        self.family.children["motors"].end()
+        self.family.start("motors", [*self._motors_words(), "--truth-port", str(self.truth_port)])
+        self.start_bridge_again()
+
     def standstill_s(self, from_s: float, until_s: float) -> float:
         """The instant of the last motion of any stage, as the motors know it."""
         path = ask_path(TruthAddress("127.0.0.1", self.truth_port), from_s, until_s)

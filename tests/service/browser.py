@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -55,6 +55,12 @@ def violations(page: Page) -> list[str]:
 
 def set_theme(page: Page, theme: str) -> None:
     page.evaluate(f"document.documentElement.dataset.theme = '{theme}'")
+
+
+def correct_positions(page: Page, positions_um: Mapping[str, int]) -> None:
+    """Type where the stages stand into the fields that hold what is assumed."""
+    for axis, at_um in positions_um.items():
+        page.locator(f"#stand-{axis}").fill(f"{at_um / 1000:.3f}")
 
 
 class Complaints(list[str]):

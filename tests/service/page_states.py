@@ -6,13 +6,14 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from attended_room import arm, calibrated, wait_for
-from browser import laid_out
+from browser import laid_out, set_theme
 from playwright.sync_api import Page, expect
 
 from service.client import RoomClient
 
 # the screens of control rooms, and a tablet held upright
 SIZES = ((1024, 768), (1280, 800), (1920, 1080), (3840, 2160), (820, 1180))
+THEMES = ("light", "dark")
 LONG = "W" * 200
 _MOST_MOVES = 12
 
@@ -23,6 +24,18 @@ def layout_faults(page: Page) -> list[str]:
     """What is wrong with the layout as it is now, in words."""
     laid_out(page)
     return list(page.evaluate(_FAULTS))
+
+
+def layout_faults_at_all_sizes(page: Page) -> dict[str, list[str]]:
+    """At each of the sizes, light and dark; only where anything is wrong."""
+    wrong = {}
+    for width, height in SIZES:
+        page.set_viewport_size({"width": width, "height": height})
+        for theme in THEMES:
+            set_theme(page, theme)
+            if faults := layout_faults(page):
+                wrong[f"{width}x{height} {theme}"] = faults
+    return wrong
 
 
 def states(page: Page, client: RoomClient) -> Iterator[str]:

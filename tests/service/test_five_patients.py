@@ -16,7 +16,7 @@ from pathlib import Path
 import pydicom
 import pytest
 from attended_room import AttendedRoom, read_off, wait_for
-from browser import laid_out
+from browser import correct_positions, laid_out
 from playwright.sync_api import Browser, Page, expect
 from playwright.sync_api import TimeoutError as PlaywrightTimeoutError
 
@@ -40,14 +40,6 @@ class Hospital(AttendedRoom):
         assert one in text
         path.write_text(text.replace(one, f'cases_dir = "{self.folder / "cases"}"'))
         return path
-
-    def power_cycle_controllers(self) -> None:
-        """They count from zero again; the stages stand where they stood."""
-        self.kill("bridge")
-        self.kill("motors")
-        self.family.children["motors"].end()
-        self.family.start("motors", [*self._motors_words(), "--truth-port", str(self.truth_port)])
-        self.start_bridge_again()
 
 
 @pytest.fixture
@@ -108,10 +100,8 @@ def arm(page: Page, client: RoomClient) -> None:
             return
         if robot.taken_um:
             expect(page.locator("#next")).to_contain_text("Assumed stage positions")
-            # as read off the stages' scales: what the bridge remembers may be too uncertain to
-            # calibrate with, and the page offers nothing but to confirm that
-            client.reset(read_off(client, robot.taken_um))
-            continue
+            # what the bridge remembers may be too uncertain to calibrate with
+            correct_positions(page, read_off(client, robot.taken_um))
         with contextlib.suppress(PlaywrightTimeoutError):  # the page was drawn anew meanwhile
             offered.click(timeout=2000)
         page.wait_for_timeout(200)

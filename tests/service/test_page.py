@@ -10,6 +10,7 @@ import httpx
 import pytest
 from attended_room import AttendedRoom, arm, calibrated, running_room, stop_all, wait_for
 from browser import laid_out, set_theme, violations
+from page_states import layout_faults_at_all_sizes
 from playwright.sync_api import Browser, Page, expect
 
 from service.client import RefusedByServiceError, RoomClient
@@ -342,14 +343,51 @@ def test_the_loss_and_return_of_a_process_are_shown(
     expect(page.locator("#alarms")).not_to_contain_text(f"The {name} has ended")
 
 
-def test_the_loss_and_return_of_the_bridge_are_shown(page: Page, room: AttendedRoom) -> None:
+def test_the_loss_and_return_of_the_bridge_are_shown_and_where_the_stages_stand_is_corrected(
+    page: Page, client: RoomClient, room: AttendedRoom
+) -> None:
+    arm(client)
     lamp = page.locator("#lights li", has_text="Robot")
     room.kill("bridge")
     expect(lamp).to_have_class("down", timeout=SLOW_MS)
     expect(page.locator("#prompt")).to_contain_text("No link to the robot")
-    room.start_bridge_again()
+    room.power_cycle_controllers()
     expect(lamp).to_have_class("up", timeout=SLOW_MS)
-    expect(page.locator("#actions")).to_contain_text("the robot")
+    robot = wait_for(client.state, lambda s: s.robot.linked and s.robot.taken_um).robot
+    expect(page.locator("#stand")).to_contain_text(robot.taken_from)
+    shown = {axis: page.locator(f"#stand-{axis}").input_value() for axis in robot.taken_um}
+    assert shown == {axis: f"{um / 1000:.3f}" for axis, um in robot.taken_um.items()}
+
+    field, wrong = page.locator("#stand-xt"), page.locator("#stand-xt-wrong")
+    confirm = page.get_by_role("button", name="Positions are right: arm the robot")
+    before = client.state().event_id
+    low_um, high_um = robot.travel_um["xt"]
+    for typed, told in (("", "type a position"), (f"{high_um / 1000 + 0.001:.3f}", "travel")):
+        field.fill(typed)
+        expect(wrong).to_contain_text(told)
+        confirm.click()
+        expect(field).to_be_focused()
+    assert f"{high_um / 1000:.2f}" in wrong.inner_text()
+    assert not violations(page)
+    assert not layout_faults_at_all_sizes(page)
+    page.set_viewport_size({"width": 1280, "height": 800})
+    assert not client.state().robot.armed
+    assert "position_declared" not in {event.kind for event in client.events(after=before)}
+
+    xt_um = robot.taken_um["xt"] + (500 if robot.taken_um["xt"] + 500 <= high_um else -500)
+    assert xt_um >= low_um
+    field.fill(f"{xt_um / 1000:.3f}")
+    expect(wrong).to_be_hidden()
+    client.describe_case("typed text stays when the page is drawn anew")
+    expect(page.locator("#room")).to_contain_text("typed text stays")
+    confirm.click()
+    expect(page.locator("#chips")).to_contain_text("Armed", timeout=SLOW_MS)
+    declared = next(e for e in client.events(after=before) if e.kind == "position_declared")
+    assert declared.body["positions_um"] == {**robot.taken_um, "xt": xt_um}
+    # what was corrected is no longer what the bridge remembers, within its bound
+    assert "xt" not in declared.body["within_um"]
+    assert client.state().robot.positions_um["xt"] == xt_um
+    room.power_cycle_controllers()  # that was not where it stands
 
 
 def test_a_service_that_hangs_greys_the_page_although_the_connection_is_open(

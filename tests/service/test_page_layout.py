@@ -4,7 +4,7 @@ import pytest
 from attended_room import AttendedRoom, arm, calibrated, stop_all, wait_for
 from browser import laid_out
 from lone_service import running_service
-from page_states import LONG, SIZES, layout_faults, states
+from page_states import LONG, SIZES, layout_faults_at_all_sizes, states
 from playwright.sync_api import Browser, Page, expect
 
 from service.client import RoomClient
@@ -17,11 +17,8 @@ def test_nothing_is_cut_and_nothing_scrolls_by_itself_in_any_state_at_any_size(
     client.describe_case(LONG, LONG, LONG)
     wrong = {}
     for state in states(page, client):
-        for width, height in SIZES:
-            page.set_viewport_size({"width": width, "height": height})
-            faults = layout_faults(page)
-            if faults:
-                wrong[f"{state} {width}x{height}"] = faults
+        if faults := layout_faults_at_all_sizes(page):
+            wrong[state] = faults
     client.describe_case("layout")
     assert not wrong
 
@@ -45,9 +42,7 @@ def test_the_login_form_fits_keeps_what_is_typed_and_no_connection_is_called_los
         page.locator("#token").fill(token)
         page.get_by_role("button", name="Log in").click()
         expect(page.locator("#who")).to_contain_text("viewer")
-        for width, height in SIZES:
-            page.set_viewport_size({"width": width, "height": height})
-            assert not layout_faults(page)
+        assert not layout_faults_at_all_sizes(page)
         page.close()
 
 

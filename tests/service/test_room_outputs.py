@@ -1,27 +1,39 @@
-"""A whole virtual room with an archive: what it gets of a puncture."""
+"""A whole virtual room with an archive and a planning workstation: what they get of a puncture."""
 
 import io
 from pathlib import Path
 
 import httpx
 import pydicom
+import pytest
 from attended_room import AttendedRoom, calibrated, running_room, wait_for
+from pynetdicom.dsutils import decode
 from receivers import ARCHIVE, receiving, wait_until
 
+from dicom_slice.plan import SPATIAL_FIDUCIALS
 from service.client import RoomClient
 from service.room.state import RoomState
 
 _PATIENCE_S = 120.0
 
 
-def test_reports_of_a_puncture_come_to_the_archive_while_the_room_works(tmp_path: Path) -> None:
-    with receiving() as archive:
+def test_a_puncture_is_reported_to_the_archive_and_the_plan_goes_to_the_workstation(
+    tmp_path: Path,
+) -> None:
+    with receiving() as archive, receiving(sop_classes=(SPATIAL_FIDUCIALS,)) as workstation:
         table = f"""
 [[outputs.destination]]
 name = "archive"
 host = "127.0.0.1"
 port = {archive.port}
 ae_title = "{ARCHIVE}"
+
+[[outputs.destination]]
+name = "workstation"
+host = "127.0.0.1"
+port = {workstation.port}
+ae_title = "{ARCHIVE}"
+kinds = ["plan"]
 """
         with running_room(tmp_path, table) as room, RoomClient(room.url) as client:
             ready = brought_to_ready(room, client)
@@ -29,7 +41,10 @@ ae_title = "{ARCHIVE}"
             outbox = f"{room.url}/api/v1/outbox"
             wait_until(lambda: {one["kind"] for one in sent(outbox)} >= {"report", "presentation"})
             wait_until(lambda: any("puncture" in one["name"] for one in sent(outbox)))
-            uids = {one["sop_instance_uid"] for one in sent(outbox)}
+            wait_until(lambda: bool(workstation.received))
+            uids = {
+                one["sop_instance_uid"] for one in sent(outbox) if one["destination"] == "archive"
+            }
             report = httpx.get(
                 f"{room.url}/api/v1/approaches/{ready.arrival.procedure_id}/report.dcm"
             ).content
@@ -37,6 +52,12 @@ ae_title = "{ARCHIVE}"
     shown = pydicom.dcmread(io.BytesIO(report))
     assert shown.Modality == "SR"
     assert str(shown.SOPInstanceUID) in uids
+    assert not set(workstation.uids) & set(archive.uids)
+    plan = decode(io.BytesIO(workstation.received[-1][1]), False, True)
+    (target,) = plan.FiducialSetSequence[0].FiducialSequence
+    assert target.FiducialIdentifier == "TARGET"
+    assert ready.target_patient_mm is not None
+    assert list(target.ContourData) == pytest.approx(ready.target_patient_mm, abs=1e-6)
 
 
 def sent(outbox: str) -> list[dict[str, str]]:
