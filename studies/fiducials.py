@@ -308,7 +308,9 @@ def bound_px(kind: Kind, snr: float = SNR) -> float:
 def _variance(kind: Kind, snr: float, place: Array) -> float:
     window = _window(kind)
     # a filter weighs noise as it weighs the object: what counts is what was sampled, unweighed
-    sampled = replace(kind, finer=1, window=lambda r, c: np.where(_kind_window(kind, r, c) > 0, 1.0, 0.0))
+    sampled = replace(
+        kind, finer=1, window=lambda r, c: np.where(_kind_window(kind, r, c) > 0, 1.0, 0.0)
+    )
     step = 1e-3
     image = np.abs(clean_image(sampled, place))
     slopes = [
