@@ -62,15 +62,14 @@ def test_what_is_no_disc_is_calibrated_steered_and_placed_truly():
     assert max(sigmas) < 0.03
 
 
-def test_a_disc_fitted_to_it_is_refused_or_unsure_and_the_template_is_not():
-    room = offline(1, cannulated(radius_mm=5.0))
-    by_disc = room.run(calibrate(calibration_arguments()))
-    by_image = offline(1, cannulated(radius_mm=5.0)).run(calibrate(BY_TEMPLATE))
-    assert by_disc.found_by == BY_DISC
-    trace = [np.trace(one.estimate.covariance_mm2) for one in (by_disc, by_image)]
-    assert trace[1] < 0.8 * trace[0]
-    with pytest.raises(ProcedureFailedError):
-        offline(1).run(calibrate(calibration_arguments()))
+@pytest.mark.parametrize("shape", [{}, {"radius_mm": 5.0}])
+def test_without_a_template_it_is_found_as_a_ring_about_a_void(shape):
+    for seed in (1, 4, 5):
+        room = offline(seed, cannulated(**shape))
+        by_disc = room.run(calibrate(calibration_arguments()))
+        assert by_disc.found_by == BY_DISC
+        apart = room.true_plane_mm - by_disc.estimate.plane_mm
+        assert apart @ np.linalg.solve(by_disc.estimate.covariance_mm2, apart) < 18  # 1e-4
 
 
 def other_bandwidth(room):
