@@ -277,9 +277,7 @@ class Execution:
         )
         if answer.choice != GO_ON:
             raise ProcedureAbortedError(f"ended by {answer.who} after an interruption")
-        self._permitted.give(self._link.status or status)
-        body = {"command_id": command_id, **self._permitted.facts(self._link.status or status)}
-        self._record.append_event("went_on", body, source=_SERVICE, who=answer.who)
+        self._permitted.give(command_id, self._link.status or status, answer.who, _SERVICE)
 
     # Slices and measurements
 

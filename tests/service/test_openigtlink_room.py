@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from attended_room import AttendedRoom, arm, calibrated, running_room, stop_all, wait_for
+from attended_room import AttendedRoom, arm, calibrated, running_room, stop_all, tidied, wait_for
 from browser import set_theme, violations
 from lone_service import CONFIG, ready_service
 from openigtlink_station import OwnStation, Station, station
@@ -260,7 +260,10 @@ def _say_everything(screen: Station, state: RoomState, number: int, order: rando
         since = screen.mark()
         screen.say(*words)
         for wanted in _answers(name, words):
-            screen.wait_for(wanted, since)
+            try:
+                screen.wait_for(wanted, since)
+            except AssertionError as error:
+                raise AssertionError(f"{name}, {words}: {error}") from None
 
 
 def _answers(name: str, words: list[object]) -> list[Callable[[Any], bool]]:
@@ -301,6 +304,7 @@ def _answers(name: str, words: list[object]) -> list[Callable[[Any], bool]]:
 def test_every_message_in_every_phase_changes_nothing_without_the_operator(room, port, seed):
     order = random.Random(seed)
     with RoomClient(room.url, by="Olga") as client, station("own", port) as screen:
+        tidied(client)
         stop_all(client)
         state = calibrated(client)
         client.set_target(beside(state, 4.0))

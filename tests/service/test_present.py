@@ -420,12 +420,19 @@ def test_a_motion_that_was_interrupted_is_not_made_again(room, answer):
     assert len(room.line.stage.begun) == begun
 
 
-def test_after_an_interruption_between_moves_only_a_new_order_moves_the_robot(room):
+def lose_power(room):
+    """The controllers, while nobody wants anything of them: they know no position any more."""
+    room.do(room.line.motors._certain.clear)
+    room.until(lambda s: not s.robot.position_certain)
+
+
+@pytest.mark.parametrize("interrupted", [lose_link_for_a_while, lose_power])
+def test_after_an_interruption_between_moves_only_a_new_order_moves_the_robot(room, interrupted):
     room.arm()
     room.do(lambda: setattr(room, "scanning", False))
     room.call("start_calibration")
     room.until(lambda s: s.acquisition_request is not None)
-    lose_link_for_a_while(room)
+    interrupted(room)
     room.arm()
     begun, asked = len(room.line.stage.begun), []
     room.do(lambda: setattr(room, "scanning", True))
