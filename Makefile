@@ -3,7 +3,6 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 ARGS   ?=
-WORKERS ?= 2
 PIP    := $(BIN)/python -m pip --disable-pip-version-check --quiet
 
 .PHONY: setup demo test quick lint bench soak docs lock clean bridge-wheel
@@ -24,13 +23,14 @@ $(VENV)/.dev: requirements-dev.lock $(VENV)/.runtime
 demo: $(VENV)/.runtime
 	$(BIN)/autospine demo $(ARGS)
 
+# Two workers a core: what starts processes mostly waits for them.
 test: $(VENV)/.dev
 	sh tests/system_packages.sh
-	$(BIN)/python -m pytest -n $(WORKERS) --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(BIN)/python -m pytest -n $(or $(WORKERS),4) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 # The pure tests: no processes, no browser.
 quick: $(VENV)/.dev
-	$(BIN)/python -m pytest -n $(WORKERS) -m "not process and not soak" $(ARGS)
+	$(BIN)/python -m pytest -n $(or $(WORKERS),2) -m "not process and not soak" $(ARGS)
 
 lint: $(VENV)/.dev
 	$(BIN)/ruff check .

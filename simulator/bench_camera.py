@@ -16,8 +16,9 @@ import socket
 import sys
 import threading
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cache, cached_property
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from pathlib import Path
 
@@ -62,28 +63,43 @@ class VirtualCamera:
 
     def sheet_points(self, tilt_deg: Sequence[float], height_mm: float) -> Floats:
         """Sheet points (x, y) mm that the subsamples of the sensor see, (rows*n, cols*n, 2)."""
-        rows, cols = self.shape
-        n = _SUBSAMPLES
-        row = (np.arange(rows * n) + 0.5) / n - rows / 2
-        col = (np.arange(cols * n) + 0.5) / n - cols / 2
-        bent = np.stack(np.meshgrid(col, row), axis=-1) / self.focal_px
-        return self._sheet_of(bent, tilt_deg, height_mm)
+        return _on_sheet(_sensor_rays(self), tilt_deg, height_mm)
 
     def true_sheet_mm(self, picture_px: Floats) -> Floats:
         """Sheet point (x, y) mm that a picture point (..., 2) in (row, col) truly shows."""
         middle = (np.array(self.shape) - 1) / 2
         bent = ((np.asarray(picture_px) - middle) / self.focal_px)[..., ::-1]
-        return self._sheet_of(bent, self.tilt_deg, self.height_mm)
+        return _on_sheet(self.ideal_rays(bent), self.tilt_deg, self.height_mm)
 
-    def _sheet_of(self, bent: Floats, tilt_deg: Sequence[float], height_mm: float) -> Floats:
+    def ideal_rays(self, bent: Floats) -> Floats:
+        """The rays (..., 2) that the lens bends into these."""
         rays = bent.copy()
         k1, k2 = self.distortion
-        for _ in range(8):  # the lens bends ideal rays into these
-            r2 = np.sum(rays**2, axis=-1, keepdims=True)
+        for _ in range(8):
+            r2 = rays[..., :1] ** 2 + rays[..., 1:] ** 2
             rays = bent / (1 + r2 * (k1 + r2 * k2))
-        turned = np.concatenate([rays, np.ones((*rays.shape[:-1], 1))], axis=-1)
-        turned = turned @ Rotation.from_euler("xyz", tilt_deg, degrees=True).as_matrix().T
-        return np.asarray(turned[..., :2] / turned[..., 2:] * height_mm)
+        return rays
+
+
+@cache
+def _sensor_rays(camera: VirtualCamera) -> Floats:
+    """Of every subsample of the sensor, (rows*n, cols*n, 2)."""
+    rows, cols = camera.shape
+    n = _SUBSAMPLES
+    row = (np.arange(rows * n) + 0.5) / n - rows / 2
+    col = (np.arange(cols * n) + 0.5) / n - cols / 2
+    return camera.ideal_rays(np.stack(np.meshgrid(col, row), axis=-1) / camera.focal_px)
+
+
+def _on_sheet(rays: Floats, tilt_deg: Sequence[float], height_mm: float) -> Floats:
+    turned = np.concatenate([rays, np.ones((*rays.shape[:-1], 1))], axis=-1)
+    turned = turned @ Rotation.from_euler("xyz", tilt_deg, degrees=True).as_matrix().T
+    return np.asarray(turned[..., :2] / turned[..., 2:] * height_mm)
+
+
+def _both(flags: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    """Whether x and y are; `np.all` takes ten times as long over so short an axis."""
+    return np.asarray(flags[..., 0] & flags[..., 1])
 
 
 class Scene:
@@ -91,9 +107,22 @@ class Scene:
 
     def __init__(self, camera: VirtualCamera, seed: int) -> None:
         self.camera = camera
-        self._points = camera.sheet_points(camera.tilt_deg, camera.height_mm)
         self._rng = np.random.default_rng(seed)
         self._last: tuple[tuple[float, ...], Floats] = ((), np.empty(0))
+
+    @cached_property
+    def _points(self) -> Floats:
+        """What the subsamples of each pixel see, (rows, cols, n*n, 2) mm."""
+        camera, n = self.camera, _SUBSAMPLES
+        rows, cols = camera.shape
+        points = camera.sheet_points(camera.tilt_deg, camera.height_mm)
+        points = points.reshape(rows, n, cols, n, 2).swapaxes(1, 2)
+        return points.reshape(rows, cols, n * n, 2)
+
+    @cached_property
+    def _pixels(self) -> Floats:
+        """What the middle of each pixel sees, (rows, cols, 2) mm."""
+        return self._points.mean(axis=2)
 
     def circle_mm(self, stage_mm: dict[str, float]) -> Floats:
         """True centre of the circle (x, y) in the plane of the sheet."""
@@ -109,11 +138,22 @@ class Scene:
         return self._noisy(light)
 
     def _light_at(self, circle_mm: Floats) -> Floats:
-        camera = self.camera
-        away = self._points - circle_mm
-        on_sheet = np.all(np.abs(away) < np.array(camera.sheet_mm) / 2, axis=-1)
-        in_circle = np.sum(away**2, axis=-1) < camera.radius_mm**2
-        return self._behind_lens(on_sheet, in_circle)
+        """From each pixel's share of sheet and circle; near an edge its subsamples are asked."""
+        camera, half_mm = self.camera, np.array(self.camera.sheet_mm) / 2
+        near_mm = 2 * camera.height_mm / camera.focal_px  # two pixels
+
+        def share(beyond: Callable[[Floats], Floats]) -> Floats:
+            """beyond: how far outside an edge points are, mm."""
+            at_pixel = beyond(self._pixels - circle_mm)
+            near = np.abs(at_pixel) < near_mm
+            seen = (at_pixel < 0).astype(np.float64)
+            seen[near] = (beyond(self._points[near] - circle_mm) < 0).mean(axis=1)
+            return seen
+
+        return self._behind_lens(
+            share(lambda away: np.maximum(*np.moveaxis(np.abs(away) - half_mm, -1, 0))),
+            share(lambda away: np.hypot(away[..., 0], away[..., 1]) - camera.radius_mm),
+        )
 
     def board_picture(
         self, squares: tuple[int, int], square_mm: float, tilt_deg: Sequence[float], away_mm: float
@@ -123,22 +163,21 @@ class Scene:
         points = self.camera.sheet_points(pose.tolist(), self.camera.height_mm + away_mm)
         size = np.array([squares[1], squares[0]]) * square_mm
         place = (points + size / 2) / square_mm
-        on_board = np.all((place >= 0) & (place < size / square_mm), axis=-1)
-        margin = np.all(np.abs(points) < size / 2 + square_mm, axis=-1)
-        black = on_board & (np.floor(place).astype(int).sum(axis=-1) % 2 == 0)
-        return self._noisy(self._behind_lens(margin, black))
+        on_board = _both((place >= 0) & (place < size / square_mm))
+        margin = _both(np.abs(points) < size / 2 + square_mm)
+        column, row = np.moveaxis(np.floor(place).astype(int), -1, 0)
+        black = on_board & ((column + row) % 2 == 0)
+        n, (rows, cols) = _SUBSAMPLES, self.camera.shape
+        shares = (
+            mask.reshape(rows, n, cols, n).mean(axis=(1, 3), dtype=np.float64)
+            for mask in (margin, black)
+        )
+        return self._noisy(self._behind_lens(*shares))
 
-    def _behind_lens(self, white: NDArray[np.bool_], coloured: NDArray[np.bool_]) -> Floats:
+    def _behind_lens(self, white: Floats, coloured: Floats) -> Floats:
         """(rows, cols, 3) light, from the share of each pixel."""
-        camera, n = self.camera, _SUBSAMPLES
-        rows, cols = camera.shape
-        shares = [
-            gaussian_filter(
-                mask.reshape(rows, n, cols, n).mean(axis=(1, 3), dtype=np.float64), camera.blur_px
-            )
-            for mask in (white, coloured)
-        ]
-        sheet, circle = (share[..., None] for share in shares)
+        camera = self.camera
+        sheet, circle = (gaussian_filter(s, camera.blur_px)[..., None] for s in (white, coloured))
         stage, white_colour, red = (np.array(c) for c in (camera.stage, camera.white, camera.red))
         return np.asarray(stage + sheet * (white_colour - stage) + circle * (red - white_colour))
 

@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.linalg.lapack import dposv
+from scipy.ndimage import binary_dilation, map_coordinates, maximum_filter
 
 from sr_engine.errors import NoRoundObjectError, NotConvergedError
 from sr_engine.model import DISC, Shape, unit_object
@@ -37,6 +38,8 @@ from sr_engine.signal import (
 Array = NDArray[np.float64]
 
 OUTLIER_SIGMA = 4.5
+_MIRRORED_SHARE = 0.4  # of an odd pixel, at its mirror image: then it is the outline
+_THINNEST_RING_PX = 1.0  # a brighter rim is no ring
 _NEIGHBOUR_SHARE = 0.55  # of that, for the neighbours of a pixel left out
 _MAX_ITERATIONS = 120  # a filtered magnitude can hold the fit at a saddle for forty
 _LONGEST_STEP_PX = 0.7  # of centre and radius
@@ -59,6 +62,7 @@ class DiscFit:
     n_pixels: int
     n_masked: int
     explained: float  # chi2 that the object takes away, against background and slopes alone
+    residual: Array  # (rows, cols) pixels less what is expected of them; 0 where none counts
 
     @property
     def centre_px(self) -> Array:
@@ -84,6 +88,17 @@ class DiscFit:
     def wall_px(self) -> float:
         """Thickness of the wall; 0 for none."""
         return float(self.parameters[WALL_PX]) if self.parameters.size > WALL else 0.0
+
+    @property
+    def is_ring(self) -> bool:
+        """About a void: its wall is resolved, and stands out twice as much as what it encloses."""
+        is_wall = self.wall_px >= _THINNEST_RING_PX
+        return is_wall and bool(abs(self.parameters[WALL]) > 2 * abs(self.amplitude))
+
+    @property
+    def outer_px(self) -> float:
+        """Radius of the outer edge of a ring about a void; else the object's own."""
+        return self.radius_px + (self.wall_px if self.is_ring else 0.0)
 
     @property
     def snr(self) -> float:
@@ -250,21 +265,37 @@ def _without_outliers(
     if mask is not problem.pixels.mask:  # those left out before may come back
         values = problem.pixels.values[mask]
         expected = moments(at.image.signal[mask], at.expected.sigma, problem.noise)
-    within = np.abs(values - expected.mean) / np.sqrt(expected.variance)
-    limit = outlier_sigma * max(1.4826 * float(np.median(within)), least_spread)
-    if not within.max() > limit:
+    signed = (values - expected.mean) / np.sqrt(expected.variance)
+    limit = outlier_sigma * max(1.4826 * float(np.median(np.abs(signed))), least_spread)
+    if not np.abs(signed).max() > limit:
         return mask
-    size = np.zeros(mask.shape)
-    size[mask] = within
-    out = size > limit
-    padded = np.pad(out, 1)
-    rows, cols = out.shape
-    near = np.zeros_like(out)
-    for i in range(3):
-        for j in range(3):
-            near |= padded[i : i + rows, j : j + cols]
+    left = np.zeros(mask.shape)
+    left[mask] = signed
+    size = np.abs(left)
+    out = (size > limit) & ~_is_mirrored(problem, left, at.image.parameters[:2])
+    near = binary_dilation(out, np.ones((3, 3)))
     keep = mask & ~out & ~(near & (size > _NEIGHBOUR_SHARE * limit))
     return keep if keep.sum() > 0.5 * mask.sum() else mask
+
+
+def _is_mirrored(problem: _Problem, left: Array, centre: Array) -> Mask:
+    """Where what is left is seen, with the same sign, on the other side of the centre as well.
+
+    A bubble or a neighbour is on one side. An outline that is no circle is so on both, or nearly:
+    to leave out one end of it would draw the centre towards the other.
+    """
+    patch = problem.pixels.patch
+    rows, cols = np.meshgrid(
+        2 * centre[0] - patch.rows - patch.rows[0],
+        2 * centre[1] - patch.cols - patch.cols[0],
+        indexing="ij",
+    )
+    mirrored = np.zeros(left.shape, dtype=bool)
+    for sign in (1.0, -1.0):
+        strongest = maximum_filter(sign * left, 3)
+        seen = map_coordinates(strongest, [rows, cols], order=0, mode="constant")
+        mirrored |= (sign * left > 0) & (seen > _MIRRORED_SHARE * sign * left)
+    return mirrored
 
 
 def _image(problem: _Problem, parameters: Array) -> _Image:
@@ -386,6 +417,9 @@ def _summary(
         information=at.information * scale**2,
     )
     n = at.residual.size
+    residual = np.zeros(problem.pixels.values.shape)
+    seen = moments(at.image.signal.take(problem.used), at.expected.sigma, problem.noise)
+    residual[problem.pixels.mask] = problem.values - seen.mean
     return DiscFit(
         parameters=parameters,
         covariance=_covariance(at, parameters, problem.model),
@@ -394,6 +428,7 @@ def _summary(
         n_pixels=n,
         n_masked=int(np.count_nonzero(~problem.pixels.mask)),
         explained=_explained(at, parameters),
+        residual=residual,
     )
 
 

@@ -7,7 +7,7 @@ the frames agree with their shifts.
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Literal, Protocol
 
 import numpy as np
@@ -33,6 +33,7 @@ from sr_engine.errors import (
 )
 from sr_engine.fit import DiscFit, fit_disc
 from sr_engine.localization import Localization
+from sr_engine.lopsided import frame_noise, with_lopsidedness
 from sr_engine.match import best_matches, correlate, radius_grid
 from sr_engine.model import DISC, Patch, Shape
 from sr_engine.noise import NoiseKind
@@ -52,6 +53,10 @@ AMBIGUOUS_RATIO = 0.9  # a second candidate of this share of the best score is a
 MINIMUM_EXPLAINED = 60.0  # chi2 that an object must take away to be one
 CONSISTENCY_P = 1e-5  # frames that agree look as bad as this once in 100,000 measurements
 MODEL_FLOOR_PX = 0.01  # what an imperfect point spread may do to one frame; check only
+MISFIT = 1.6  # of the frame's noise, left by a disc: then a ring is tried
+RING_WALLS, MOST_WALL_PX = (0.6, 0.4), 3.5  # of the outer radius
+LEAST_VOID_PX = 0.6
+RING_GAIN = 0.7  # of what a disc leaves
 FOLDING_MARGIN_PX = 6.0
 LARGEST_PERIOD_PX = 160  # ringing that comes round from farther away is below 1e-4 of the object
 
@@ -87,7 +92,8 @@ def localize(
       `recognise`). noise: "rician", or "gaussian" (default for a psf
       that folds, a camera, and where pixels are negative).
     sigma: noise std per channel, where known.
-    wall_px: expected thickness of a shell about the object, where it has one.
+    wall_px: expected thickness of a shell about the object, where it has one. Without, a ring about
+      a void is told from a disc.
     shift_sigma_px: std per axis of a frame's shift (the motor's repeatability).
     gate_px: refuse an object farther than this from start_px.
     saturation_level: pixel value at which the source saturates, where known.
@@ -112,44 +118,85 @@ def localize(
     noise = noise or noise_kind(stack, psf)
     fits: list[DiscFit] = []
     bounds = (0.8 * radii[0], 1.2 * radii[1])
+    how = _How(psf, bounds, shape, wall_px, noise, sigma, robust)
     for frame, shift in zip(stack, shifts, strict=True):
         begin = (guess[0] + shift[0], guess[1] + shift[1], guess[2])
         pixels = region_of_interest(frame, begin, psf)
         refuse_saturated(pixels.values, guess[2], saturation_level)
-        # the first frame tells the others all but the place
-        like = fits[-1].moved_to(np.array(begin[:2])) if fits else begin
-        fit = fit_disc(
-            pixels, like, psf, radius_bounds_px=bounds, shape=shape, wall_px=wall_px,
-            noise=noise, sigma=sigma, robust=robust,
-        )  # fmt: skip
+        level = frame_noise(frame, noise) if sigma is None else sigma
+        if fits:  # the first frame tells the others all but the place
+            fit = how.fit(pixels, fits[-1].moved_to(np.array(begin[:2])))
+        else:
+            how, fit = _disc_or_ring(pixels, begin, how, level)
         if fit.n_masked > np.count_nonzero(~pixels.mask):
-            whole = _without_mask(pixels, fit, psf, bounds, shape, wall_px, noise, sigma)
+            whole = _without_mask(pixels, fit, how)
             fit = fit if whole is None else _widened_by_mask(fit, whole)
+        if not psf.folds:  # what a camera folds differs from pixel to pixel, and draws no edge
+            fit = with_lopsidedness(fit, pixels, level)
         _refuse_doubtful(fit, begin, frame.shape)
         fits.append(fit)
-        guess = (*(fit.centre_px - shift), fit.radius_px)
-    radius = float(np.mean([fit.radius_px for fit in fits]))
+        guess = (*(fit.centre_px - shift), fit.outer_px)
+    radius = float(np.mean([fit.outer_px for fit in fits]))
     result = combined(fits, shifts, radius, shift_sigma_px, psf=psf)
     _refuse_outside_gate(result.centre_px, start, gate_px)
     return result
 
 
-def _without_mask(
-    pixels: Pixels,
-    like: DiscFit,
-    psf: Psf,
-    bounds: tuple[float, float],
-    shape: Shape,
-    wall_px: float | None,
-    noise: NoiseKind,
-    sigma: float | None,
-) -> DiscFit | None:
+@dataclass(frozen=True)
+class _How:
+    """What is fitted, and how; see `fit_disc`."""
+
+    psf: Psf
+    bounds_px: tuple[float, float]
+    shape: Shape
+    wall_px: float | None
+    noise: NoiseKind
+    sigma: float | None
+    robust: bool
+
+    def fit(self, pixels: Pixels, start: tuple[float, float, float] | DiscFit) -> DiscFit:
+        return fit_disc(
+            pixels, start, self.psf, radius_bounds_px=self.bounds_px, shape=self.shape,
+            wall_px=self.wall_px, noise=self.noise, sigma=self.sigma, robust=self.robust,
+        )  # fmt: skip
+
+
+def _disc_or_ring(
+    pixels: Pixels, begin: tuple[float, float, float], how: _How, noise_std: float
+) -> tuple[_How, DiscFit]:
+    """The disc, or, where that leaves more than noise, a ring about a void if it leaves less."""
+    disc: DiscFit | None = None
+    try:
+        disc = how.fit(pixels, begin)
+    except (NoRoundObjectError, NotConvergedError) as error:
+        if how.wall_px is not None or how.shape != DISC:
+            raise
+        failed = error
+    if disc is not None and (how.wall_px is not None or disc.sigma < MISFIT * noise_std):
+        return how, disc
+    best = None
+    for share in RING_WALLS:
+        wall_px = min(share * begin[2], MOST_WALL_PX)
+        ring = replace(how, wall_px=wall_px, bounds_px=(LEAST_VOID_PX, how.bounds_px[1]))
+        try:
+            fit = ring.fit(pixels, (begin[0], begin[1], begin[2] - wall_px))
+        except (NoRoundObjectError, NotConvergedError):
+            continue
+        outer = fit.radius_px + fit.wall_px
+        is_like = fit.is_ring and how.bounds_px[0] < outer < how.bounds_px[1]
+        if is_like and (best is None or fit.sigma < best[1].sigma):
+            best = ring, fit
+    if best is not None and (disc is None or best[1].sigma < RING_GAIN * disc.sigma):
+        return best
+    if disc is None:
+        raise failed
+    return how, disc
+
+
+def _without_mask(pixels: Pixels, like: DiscFit, how: _How) -> DiscFit | None:
     """The fit to all pixels; None where it does not settle."""
     try:
-        return fit_disc(
-            pixels, like, psf, radius_bounds_px=bounds, shape=shape, wall_px=wall_px,
-            noise=noise, sigma=sigma, robust=False,
-        )  # fmt: skip
+        return replace(how, robust=False).fit(pixels, like)
     except (NoRoundObjectError, NotConvergedError):
         return None
 
@@ -301,7 +348,7 @@ def _refuse_doubtful(
         raise NotConvergedError(f"the fit moved {moved:.1f} px away from its start")
     refuse_cut_by_border(
         (float(fit.centre_px[0]), float(fit.centre_px[1])),
-        fit.radius_px,
+        fit.outer_px,
         (frame_shape[0], frame_shape[1]),
     )
 

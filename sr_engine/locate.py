@@ -14,6 +14,7 @@ from sr_engine.detect import Candidate, detect
 from sr_engine.errors import EngineError, NoRoundObjectError
 from sr_engine.fit import DiscFit, fit_disc
 from sr_engine.localize import noise_kind, region_of_interest
+from sr_engine.lopsided import frame_noise, with_lopsidedness
 from sr_engine.model import DISC, unit_object
 from sr_engine.psf import Psf
 from sr_engine.signal import Pixels
@@ -135,20 +136,22 @@ def _fit(
     image: Array, candidate: Candidate, radius: float, wall_px: float | None, psf: Psf
 ) -> DiscFit:
     row, col = candidate.centre_px
+    noise = noise_kind(image, psf)
+    pixels = region_of_interest(image, (row, col, radius + (wall_px or 0.0)), psf)
     fit = fit_disc(
-        region_of_interest(image, (row, col, radius + (wall_px or 0.0)), psf),
+        pixels,
         (row, col, radius),
         psf,
         radius_bounds_px=(RADIUS_FREEDOM[0] * radius, RADIUS_FREEDOM[1] * radius),
         wall_px=wall_px,
-        noise=noise_kind(image, psf),
+        noise=noise,
         outlier_sigma=GROSS_SIGMA,
         whiten=False,  # on real slices the model's own imperfection is what remains
     )
     moved = float(np.hypot(*(fit.centre_px - candidate.centre_px)))
     if not moved < max(FARTHEST_PX, candidate.radius_px / 3):
         raise NoRoundObjectError(f"the fit at row {row:.1f}, col {col:.1f} ran {moved:.1f} px away")
-    return fit
+    return with_lopsidedness(fit, pixels, frame_noise(image, noise))
 
 
 def _best_starts(image: Array, candidate: Candidate, psf: Psf) -> list[tuple[float, float | None]]:

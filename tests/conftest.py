@@ -2,7 +2,9 @@
 waits for the other's last long file. This folder is where every test finds `real_slices`.
 """
 
+import os
 import re
+import sys
 from functools import cache
 from pathlib import Path
 
@@ -13,7 +15,12 @@ from hypothesis import HealthCheck, settings
 settings.register_profile("patient", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("patient")
 
-_HERE = Path(__file__).parent
+# Hundreds of processes start here: none compiles our modules anew, and none takes both cores for
+# sums that one does as soon.
+sys.dont_write_bytecode = False
+os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 _FIXTURES = {"shared_room", "stages", "receiver", "start", "demo", "client", "browser", "page"}
 _STARTS = re.compile(r"^\s*(?:import|from) (?:subprocess|playwright|multiprocessing)\b", re.M)
 _IMPORTS = re.compile(r"^from (\w+) import|^import (\w+)$", re.M)

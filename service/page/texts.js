@@ -140,7 +140,7 @@ export const TEXTS = {
   },
   caseDesk: {
     label: "Case name (no patient name)", operator: "Operator", note: "Note", start: "Start the case", goOn: "Continue this case",
-    finish: "Finish the case …", finishNow: "Finish the case now", notYet: "Not yet",
+    finish: "Finish the case …", finishNow: "Finish the case now", notYet: "Not yet", park: "Park the drives",
     finishWhy: "This disarms the robot and closes the case. Report and export are written to its folder.",
     columns: ["What", "Received", "Why", ""], take: "Add to this case",
   },

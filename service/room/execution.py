@@ -108,6 +108,8 @@ class Execution:
     def answer(self, choice: str, who: str) -> None:
         self._answer = Answered(choice, who)
         self.question = None  # at once: nobody sees or answers it a second time
+        if choice == CONFIRM and self._link.status is not None:
+            self._permitted.confirm(self._link.status)
 
     def abort(self, reason: str) -> None:
         """End the running procedure at its next look; nothing if none runs."""
@@ -277,9 +279,7 @@ class Execution:
         )
         if answer.choice != GO_ON:
             raise ProcedureAbortedError(f"ended by {answer.who} after an interruption")
-        self._permitted.give(self._link.status or status)
-        body = {"command_id": command_id, **self._permitted.facts(self._link.status or status)}
-        self._record.append_event("went_on", body, source=_SERVICE, who=answer.who)
+        self._permitted.give(command_id, self._link.status or status, answer.who, _SERVICE)
 
     # Slices and measurements
 
@@ -449,8 +449,6 @@ class Execution:
         while self._answer is None:
             self._wait()
         self.question = None
-        if self._answer.choice == CONFIRM and self._link.status is not None:
-            self._permitted.give(self._link.status)
         return self._answer
 
     def _wait(self) -> None:

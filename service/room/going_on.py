@@ -1,7 +1,8 @@
 """By whose order a procedure moves: given as the robot stood, and good only while it stands so.
 
 After a stop, a lost link or a restart nothing that was asked for before moves anything again: not
-by re-arming, only by a new order ("go on").
+by re-arming, only by a new order ("go on"). Whatever was re-armed since had been interrupted,
+whether anybody was looking at the robot while it was or not.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from typing import Any
 from case_record.record import CaseRecord
 from robot_bridge.client.client import BridgeStatus
 
+ARMED = "armed"
 GO_ON = "go_on"
 WENT_ON = "went_on"
 
@@ -21,6 +23,7 @@ class Permitted:
     def __init__(self, record: CaseRecord) -> None:
         self._record = record
         self._given: dict[str, Any] | None = None
+        self._given_by = 0  # the event by which it was given
         self._interrupted = False
 
     def facts(self, status: BridgeStatus) -> dict[str, Any]:
@@ -39,10 +42,18 @@ class Permitted:
         given = went_on if went_on is not None and went_on.seq > running.begun_seq else begun
         body = {} if given is None else given.body
         self._given = {name: body.get(name) for name in ("boot_id", "stop_count")}
+        self._given_by = 0 if given is None else given.event_id
 
-    def give(self, status: BridgeStatus) -> None:
-        """Somebody ordered it as the robot stands now."""
+    def give(self, command_id: str, status: BridgeStatus, who: str, source: str) -> None:
+        """Somebody says to go on, as the robot stands now."""
         self._given = self.facts(status)
+        body = {"command_id": command_id, **self._given}
+        self._given_by = self._record.append_event(WENT_ON, body, source=source, who=who)
+        self._interrupted = False
+
+    def confirm(self, status: BridgeStatus) -> None:
+        """Somebody confirms the move that was asked about, as the robot stands now."""
+        self._given, self._given_by = self.facts(status), self._record.last_event_id()
         self._interrupted = False
 
     def interrupt(self) -> None:
@@ -51,7 +62,9 @@ class Permitted:
 
     def covers(self, status: BridgeStatus) -> bool:
         """Whether that order still stands."""
-        return not self._interrupted and self._given == self.facts(status)
+        armed = self._record.last_event(ARMED)
+        armed_since = armed is not None and armed.event_id > self._given_by
+        return not (self._interrupted or armed_since) and self._given == self.facts(status)
 
     def forget(self) -> None:
         self._given = None

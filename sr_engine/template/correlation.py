@@ -5,57 +5,117 @@ covers it. What is left of several frames of one object beside their common imag
 shows its correlation at the place where it counts.
 """
 
+from dataclasses import dataclass
+from functools import cached_property
+
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
 
-LEAST_SIGMA = 3.5  # of a lag's own uncertainty, before it is believed
+CHANCE_SIGMA = 3.5  # of chi2 of all lags, before any is believed
 WHITE_SHARE = 0.3  # of the noise power, in the weights: what is measured is not leant on entirely
+_LEAST_POWER = 1e-6
+_CORRECTIONS = 4  # of what a fit took away
 
 
-def lag_correlation(residuals: Array, mask: Mask, reach: int) -> tuple[Array, Array]:
-    """Correlation at lags (0..reach rows, 0..reach columns), and its standard error.
+@dataclass(frozen=True, eq=False)
+class Colour:
+    """Power spectrum (n, n) of the noise, of mean 1, in FFT order, on the grid of a patch."""
 
-    residuals: (M, rows, cols) standardised; mask: (rows, cols) pixels that count. Lags to the left
-    and to the right are taken together.
+    power: Array
+
+    @classmethod
+    def of_lags(cls, table: Array, size: int) -> "Colour":
+        """From the correlation at lags (0..reach rows, 0..reach columns); made positive."""
+        reach = len(table) - 1
+        index = np.abs(np.arange(-reach, reach + 1))
+        lags = np.zeros((size, size))
+        lags[np.ix_(np.arange(-reach, reach + 1), np.arange(-reach, reach + 1))] = table[
+            np.ix_(index, index)
+        ]
+        power = np.maximum(scipy.fft.fft2(lags).real, _LEAST_POWER)
+        return cls(np.asarray(power / power.mean()))
+
+    def correlated(self, columns: Array, mask: Mask) -> Array:
+        """(p, c) columns of the pixels of a mask, times the correlation of those pixels."""
+        return self._filtered(columns, mask, self.power)
+
+    def weighed(self, columns: Array, mask: Mask) -> Array:
+        """The same times the inverse, softened by a share of white noise, near enough."""
+        softened = (1 - WHITE_SHARE) * self.power + WHITE_SHARE
+        return self._filtered(columns, mask, 1 / softened)
+
+    def _filtered(self, columns: Array, mask: Mask, by: Array) -> Array:
+        size = len(mask)
+        images = np.zeros((columns.shape[1], size, size))
+        images[:, mask] = columns.T
+        spectra = scipy.fft.rfft2(images) * by[:, : size // 2 + 1]
+        return np.asarray(scipy.fft.irfft2(spectra, (size, size))[:, mask].T)
+
+
+@dataclass(frozen=True, eq=False)
+class Lags:
+    """Sums over pairs of pixels of a mask (rows, cols), at lags (0..reach rows, 0..reach columns).
+
+    Lags to the left and to the right are taken together. pairs: how many of one patch.
     """
-    sums = np.zeros((reach + 1, reach + 1))
-    pairs = np.zeros_like(sums)
-    values = np.where(mask, residuals, 0.0)
-    rows, cols = mask.shape
-    for i in range(min(reach, rows - 1) + 1):
-        for j in range(-min(reach, cols - 1), min(reach, cols - 1) + 1):
-            here = np.s_[: rows - i, max(0, -j) : cols - max(0, j)]
-            there = np.s_[i:, max(0, j) : cols - max(0, -j)]
-            sums[i, abs(j)] += float(np.sum(values[:, *here] * values[:, *there]))
-            pairs[i, abs(j)] += len(values) * np.count_nonzero(mask[here] & mask[there])
-    mean = sums / np.maximum(pairs, 1)
-    return mean / mean[0, 0], 1 / np.sqrt(np.maximum(pairs, 1))
+
+    mask: Mask
+    reach: int
+
+    @cached_property
+    def pairs(self) -> Array:
+        return np.maximum(self._sums(*[self.mask[None].astype(np.float64)] * 2), 1.0)
+
+    def mean(self, first: Array, second: Array) -> Array:
+        """Mean product of pixels of first (M, rows, cols) with those of second, at each lag."""
+        return self._sums(first, second) / self.pairs
+
+    def _sums(self, first: Array, second: Array) -> Array:
+        reach = self.reach
+        shape = tuple(scipy.fft.next_fast_len(n + reach, real=True) for n in self.mask.shape)
+        spectra = scipy.fft.rfft2(np.where(self.mask, first, 0.0), shape)
+        others = spectra if second is first else scipy.fft.rfft2(second * self.mask, shape)
+        lags = scipy.fft.irfft2(np.sum((spectra.conj() * others).real, axis=0), shape)
+        folded = lags[: reach + 1, : reach + 1].copy()
+        folded[:, 1:] += lags[: reach + 1, : -reach - 1 : -1]
+        return folded
 
 
-def believed(correlation: Array, error: Array) -> Array:
-    """The lags that stand out from chance; the others are taken for 0."""
-    table = np.where(np.abs(correlation) > LEAST_SIGMA * error, correlation, 0.0)
+def lag_correlation(residuals: Array, lags: Lags, taken: Array) -> tuple[float, Array, Array]:
+    """Variance over what is left, correlation at lags, and its standard error.
+
+    residuals: (M, rows, cols) standardised. taken (p, K): what the fit took away with it, H = taken
+    taken': noise that is drawn out far is taken for background in part, and what is left of it
+    shows less of it than there was: (1 - H) C (1 - H), of which C is sought.
+    """
+    mask, size = lags.mask, len(lags.mask)
+    seen = lags.mean(residuals, residuals) / len(residuals)
+    scale = max(float(seen[0, 0]), 1e-300)
+    seen = seen / scale
+    images = np.zeros((taken.shape[1], size, size))
+    images[:, mask] = taken.T
+    found = seen
+    for _ in range(_CORRECTIONS):
+        colour = Colour.of_lags(found / found[0, 0], size)
+        spread = colour.correlated(taken, mask) * found[0, 0]
+        lost = np.zeros_like(images)
+        lost[:, mask] = (2 * spread - taken @ (taken.T @ spread)).T
+        found = seen + lags.mean(images, lost)
+    error = 1 / np.sqrt(lags.pairs * len(residuals))
+    return float(found[0, 0]), found / found[0, 0], error
+
+
+def believed(correlation: Array, error: Array) -> Array | None:
+    """The lags, each drawn to 0 as far as chance explains it; None where it explains them all."""
+    squares = (correlation / error) ** 2
+    squares[0, 0] = 0.0
+    lags = squares.size - 1
+    if float(squares.sum()) < lags + CHANCE_SIGMA * np.sqrt(2 * lags):
+        return None
+    table = correlation * squares / (squares + 1)
     table[0, 0] = 1.0
-    return table
-
-
-def correlation_matrix(table: Array, mask: Mask) -> Array:
-    """(n, n) of the pixels of a mask, positive semi-definite, ones on its diagonal."""
-    row, col = np.nonzero(mask)
-    lag_row, lag_col = np.abs(row[:, None] - row), np.abs(col[:, None] - col)
-    reach = len(table) - 1
-    near = (lag_row <= reach) & (lag_col <= reach)
-    matrix = np.where(near, table[np.minimum(lag_row, reach), np.minimum(lag_col, reach)], 0.0)
-    values, vectors = np.linalg.eigh(matrix)
-    matrix = (vectors * np.maximum(values, 0.0)) @ vectors.T
-    scale = np.sqrt(np.diag(matrix))
-    return np.asarray(matrix / np.outer(scale, scale))
-
-
-def weight_matrix(matrix: Array) -> Array:
-    """(n, n) inverse of the correlation with a share of white noise: the weights of a fit."""
-    softened = (1 - WHITE_SHARE) * matrix + WHITE_SHARE * np.eye(len(matrix))
-    return np.asarray(np.linalg.inv(softened))
+    return np.asarray(table)

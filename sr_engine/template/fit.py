@@ -8,15 +8,18 @@ weights are not the best.
 """
 
 from dataclasses import dataclass
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from sr_engine.errors import NotConvergedError, ObjectAtBorderError, TemplateMismatchError
-from sr_engine.noise import NoiseKind, moments
+from sr_engine.noise import NoiseKind
 from sr_engine.signal import SLOPE_SCALES, mixture_precision
+from sr_engine.template.correlation import Colour
 from sr_engine.template.image import ObjectImage
+from sr_engine.template.magnitude import Expected, expected
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -34,32 +37,57 @@ _ROW, _COL, _AMPLITUDE, _BACKGROUND = range(4)
 class Metric:
     """How the pixels of a frame scatter about the template.
 
-    mask (n, n): pixels of the patch that count. kind, sigma: of magnitudes, the noise std per
-    channel; scale: by how much their variance is more than that. variances (3,): of other pixels
-    in air, at the edge and on the plateau, top being its level. correlation, weights: (p, p) of
-    the p pixels of the mask, None where the noise is white (weights None: not used). widened:
-    factor of the covariance.
+    mask (n, n): pixels of the patch that count. kind "rician": magnitudes of so many channels, of
+    noise std sigma each; "gaussian": other pixels. scales (3,): variance of air, edge and plateau,
+    top being its level, over that of the magnitudes, or as it is. colour: correlation of the
+    noise, None where it is white; is_weighed: whether the fit heeds it. widened: factor of the
+    covariance.
     """
 
     mask: Mask
     kind: NoiseKind
     sigma: float
-    variances: Array
-    scale: float = 1.0
+    scales: Array
+    channels: float = 1.0
     top: float = 1.0
-    correlation: Array | None = None
-    weights: Array | None = None
+    colour: Colour | None = None
+    is_weighed: bool = False
     widened: float = 1.0
 
     @classmethod
-    def white(cls, mask: Mask, kind: NoiseKind, sigma: float) -> "Metric":
-        return cls(mask, kind, sigma, np.full(3, sigma**2))
+    def white(cls, mask: Mask, sigma: float, channels: float | None) -> "Metric":
+        """Of magnitudes of so many channels, or of other pixels (None)."""
+        if channels is None:
+            return cls(mask, "gaussian", sigma, np.full(3, sigma**2))
+        return cls(mask, "rician", sigma, np.ones(3), channels)
 
-    def variance(self, signal: Array) -> Array:
+    def expected(self, signal: Array) -> Expected:
+        """Of pixels (p,) of the noise-free image, not negative where they are magnitudes."""
         if self.kind == "rician":
-            return moments(signal, self.sigma, "rician").variance * self.scale
-        air, edge, plateau = self.variances
-        return np.interp(signal / self.top, _KNOTS, (air, air, edge, plateau))
+            mean, slope, variance = expected(signal, self.sigma, self.channels)
+        else:
+            mean, slope, variance = signal, np.ones_like(signal), np.ones_like(signal)
+        air, edge, plateau = self.scales
+        scale = np.interp(signal / self.top, _KNOTS, (air, air, edge, plateau))
+        return Expected(mean, slope, variance * scale)
+
+    def weighed(self, rows: Array) -> Array:
+        """(c, p) rows, as the fit weighs them."""
+        if self.colour is None or not self.is_weighed:
+            return rows
+        return self.colour.weighed(rows.T, self.mask).T
+
+    @cached_property
+    def places(self) -> tuple[Array, Array]:
+        """(p,) rows and columns of the pixels that count, from the middle of the patch."""
+        row, col = np.nonzero(self.mask)
+        middle = len(self.mask) // 2
+        return row.astype(np.float64) - middle, col.astype(np.float64) - middle
+
+    @cached_property
+    def used(self) -> NDArray[np.intp]:
+        """(p,) indices of the pixels that count, in the flattened patch."""
+        return np.flatnonzero(self.mask)
 
 
 @dataclass(frozen=True, eq=False)
@@ -93,26 +121,33 @@ def patch_of(frame: Array, centre: Array, size: int) -> Array:
     return np.asarray(frame[rows[:, None], cols[None, :]], dtype=float)
 
 
-def _places(mask: Mask) -> tuple[Array, Array]:
-    places = np.argwhere(mask).astype(np.float64) - len(mask) // 2
-    return places[:, 0], places[:, 1]
-
-
-def linear_fit(values: Array, signal: Array, metric: Metric, size: int) -> LinearFit:
-    """Amplitude, background and slopes of one patch, its centre known. values, signal: (p,)."""
-    row, col = _places(metric.mask)
-    expected = moments(signal, metric.sigma, metric.kind)
-    basis = np.stack([signal * expected.slope, np.ones(row.size), row, col], axis=1)
-    weight = 1 / np.sqrt(metric.variance(signal))
-    prior = _prior(np.zeros(6), metric)[_AMPLITUDE:] if metric.kind == "rician" else np.zeros(4)
-    weighed = basis * weight[:, None]
-    target = values - expected.mean + signal * expected.slope
-    system = weighed.T @ weighed + np.diag(prior + 1e-12 * np.sum(weighed**2, axis=0))
-    a, b, by_row, by_col = np.linalg.solve(system, weighed.T @ (target * weight))
-    x = np.arange(size) - size // 2
+def linear_fit(values: Array, signal: Array, metric: Metric) -> LinearFit:
+    """Amplitude, background and slopes of a given image (p,) in the pixels (p,) of the mask."""
+    shown = metric.expected(signal)
+    basis, system = _linear_system(signal, shown, metric)
+    target = basis @ ((values - shown.mean + basis[0]) / shown.variance)
+    a, b, by_row, by_col = np.linalg.solve(system, target)
+    x = np.arange(len(metric.mask)) - len(metric.mask) // 2
     plane = b + by_row * x[:, None] + by_col * x[None, :]
-    left = values - moments(a * signal, metric.sigma, metric.kind).mean - plane[metric.mask]
-    return LinearFit(float(a), plane, left)
+    again = metric.expected(max(float(a), 0.0) * signal)
+    return LinearFit(float(a), plane, values - again.mean - plane[metric.mask])
+
+
+def _linear_system(signal: Array, shown: Expected, metric: Metric) -> tuple[Array, Array]:
+    row, col = metric.places
+    basis = np.stack([signal * shown.slope, np.ones(row.size), row, col])
+    prior = _prior(np.zeros(6), metric)[_AMPLITUDE:] if metric.kind == "rician" else np.zeros(4)
+    system = (basis / shown.variance) @ basis.T
+    system.flat[::5] += prior + 1e-12 * system.diagonal()
+    return basis, system
+
+
+def taken_by_fit(signal: Array, metric: Metric) -> Array:
+    """(p, 4) T: a linear fit takes T T' of the standardised pixels."""
+    shown = metric.expected(signal)
+    basis, system = _linear_system(signal, shown, metric)
+    lower = np.linalg.cholesky(system)
+    return np.asarray(np.linalg.solve(lower, basis / np.sqrt(shown.variance)).T)
 
 
 def _prior(parameters: Array, metric: Metric) -> Array:
@@ -163,32 +198,32 @@ class _Settled:
 
 
 def _settled(values: Array, image: ObjectImage, metric: Metric, start: Array) -> _Settled:
-    row, col = _places(metric.mask)
+    row, col = metric.places
     parameters = np.zeros(6)
-    parameters[:2], parameters[_AMPLITUDE] = start, 1.0
-    first = linear_fit(values, image.at(start)[0][metric.mask], metric, image.size)
+    parameters[:2] = start
+    parts = image.at(start)
+    first = linear_fit(values, parts[0].take(metric.used), metric)
     parameters[_AMPLITUDE] = max(first.amplitude, 0.05)
-    for _ in range(_ITERATIONS):
-        signal, d_row, d_col = (part[metric.mask] for part in image.at(parameters[:2]))
+    jacobian = np.empty((6, values.size))
+    for number in range(_ITERATIONS):
+        parts = parts if number == 0 else image.at(parameters[:2])
+        signal, d_row, d_col = (part.take(metric.used) for part in parts)
         amplitude, background, by_row, by_col = parameters[_AMPLITUDE:]
-        expected = moments(amplitude * signal, metric.sigma, metric.kind)
-        variance = metric.variance(max(amplitude, 0.05) * signal)
+        shown = metric.expected(max(amplitude, 0.05) * signal)
         # alike for all pixels: air is surer, but it is there that a template is least so
-        weight = np.full_like(variance, 1 / np.sqrt(float(variance.mean())))
-        slope = expected.slope * weight
-        jacobian = np.stack(
-            [amplitude * d_row * slope, amplitude * d_col * slope, signal * slope,
-             weight, row * weight, col * weight], axis=1
-        )  # fmt: skip
-        residual = (values - expected.mean - background - by_row * row - by_col * col) * weight
-        weighed = jacobian if metric.weights is None else metric.weights @ jacobian
+        weight = 1 / np.sqrt(float(shown.variance.mean()))
+        slope = shown.slope * weight
+        jacobian[:3] = amplitude * d_row, amplitude * d_col, signal
+        jacobian[:3] *= slope
+        jacobian[3], jacobian[4], jacobian[5] = weight, row * weight, col * weight
+        residual = (values - shown.mean - background - by_row * row - by_col * col) * weight
+        weighed = metric.weighed(jacobian)
         precision = _prior(parameters, metric)
-        system = weighed.T @ jacobian + np.diag(precision)
         try:
-            inverse = np.linalg.inv(system)
+            inverse = np.linalg.inv(weighed @ jacobian.T + np.diag(precision))
         except np.linalg.LinAlgError:
             raise NotConvergedError("the template has no contrast left") from None
-        step = inverse @ (weighed.T @ residual - precision * parameters)
+        step = inverse @ (weighed @ residual - precision * parameters)
         longest = float(np.max(np.abs(step[:2])))
         if not np.all(np.isfinite(step)):
             raise NotConvergedError("the template has no contrast left")
@@ -201,10 +236,10 @@ def _settled(values: Array, image: ObjectImage, metric: Metric, start: Array) ->
     else:
         raise NotConvergedError(f"the template fit did not converge in {_ITERATIONS} steps")
     pull = inverse @ (precision * parameters)
-    gain = (weighed @ inverse.T) * (np.sqrt(variance) * weight)[:, None]
-    spread = gain if metric.correlation is None else metric.correlation @ gain
-    standard = residual / (np.sqrt(variance) * weight)
-    return _Settled(parameters, gain.T @ spread + np.outer(pull, pull), standard)
+    spread = np.sqrt(shown.variance) * weight
+    gain = (inverse @ weighed * spread).T
+    both = gain if metric.colour is None else metric.colour.correlated(gain, metric.mask)
+    return _Settled(parameters, gain.T @ both + np.outer(pull, pull), residual / spread)
 
 
 def _summary(fit: _Settled, whole: Array, metric: Metric) -> TemplateFit:
@@ -217,7 +252,7 @@ def _summary(fit: _Settled, whole: Array, metric: Metric) -> TemplateFit:
             f"(chi2 {chi2:.1f} per pixel, amplitude {amplitude:.2f} of the template's)"
         )
     grown = metric.widened * max(1.0, chi2 if chi2 > 1 + 4 * np.sqrt(2 / n) else 1.0)
-    noise = metric.sigma if metric.kind == "rician" else float(np.sqrt(metric.variances[-1]))
+    noise = float(np.sqrt(metric.scales[-1])) * (metric.sigma if metric.kind == "rician" else 1.0)
     residual = np.zeros(metric.mask.shape)
     residual[metric.mask] = fit.residual
     return TemplateFit(

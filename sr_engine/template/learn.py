@@ -6,7 +6,6 @@ also show what remains: the noise's size at every level of signal, its correlati
 were displaced as is said.
 """
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -14,16 +13,24 @@ from numpy.typing import ArrayLike, NDArray
 
 from sr_engine.checks import checked_frames, checked_shifts
 from sr_engine.errors import EngineError, TemplateError
-from sr_engine.noise import NoiseKind
-from sr_engine.template.correlation import (
-    believed,
-    correlation_matrix,
-    lag_correlation,
-    weight_matrix,
+from sr_engine.template.correlation import Colour, Lags, believed, lag_correlation
+from sr_engine.template.fit import (
+    Metric,
+    TemplateFit,
+    fit_image,
+    linear_fit,
+    patch_of,
+    taken_by_fit,
 )
-from sr_engine.template.fit import Metric, TemplateFit, fit_image, linear_fit, patch_of
-from sr_engine.template.image import ObjectImage, Views, averaged_image, magnitude_image
-from sr_engine.template.middle import absolute_centre
+from sr_engine.template.image import (
+    Averaged,
+    ObjectImage,
+    Views,
+    averaged_image,
+    magnitude_image,
+)
+from sr_engine.template.magnitude import channels_of_air
+from sr_engine.template.middle import absolute_centre, outline_middle
 from sr_engine.template.moving import Moving, moving_object
 from sr_engine.template.search import find_object
 
@@ -34,10 +41,14 @@ MARGIN_PX = 4.0  # about the object, fitted with it; half its radius where that 
 TAPER_PX = 5.0  # beyond, in which the image is let fade
 LARGEST_MARGIN_PX = 8.0
 LAGS_PX = 4  # over which noise may be correlated
-_ROUNDS = 3
+_ROUNDS = 2
 _LEVELS = (0.12, 0.75)  # of the highest signal: air, edge and plateau have their own noise
-_AIR_RATIO = (np.pi / 4, 0.03)  # mean squared over mean square of Rayleigh noise, and how near
+_LEAST_CHANCE = 0.8  # of the covariance: scatter that is smaller than that is luck
+_LEVEL_PIXELS = 300.0  # what the noise of all levels weighs, beside that of one
+_LEAST_LEVEL_PIXELS = 30.0  # the same, of pixels that are no magnitudes
+_MAGNITUDES, _NO_MAGNITUDES = 1.4, 2.5  # unevenness: below they are, beyond they are none
 _MOST_SCATTER = 12.0  # chi2 a degree of freedom of the displacements: more is no chance
+_LEAST_NOISE = 0.05  # of the noise power at any frequency: none is without
 _PRIOR_FRAMES = 10.0  # what the pixels' own account of the noise weighs, in frames
 _LEAST_VARIANCE = 0.1  # of a level's noise, over that of all: denoised air is not sure
 _LEAST_SIGNIFICANCE = 8.0  # of the amplitude
@@ -90,13 +101,15 @@ def learn_template(
     radius_px: tuple[float, float] | None = None,
     centre_px: ArrayLike | None = None,
     shift_sigma_px: float = 0.0,
+    shifts_are_fitted: bool = False,
 ) -> Template:
     """Learn the image of the object that moves by shifts_px.
 
     frames (M, rows, cols) of one size; shifts_px (M, 2) displacement (row, col) of the object in
     each from the reference pose. radius_px: least and largest radius of its outline. centre_px:
     where it is in the reference pose, to a pixel; else it is looked for: the one compact thing
-    that moves as is said. shift_sigma_px: std per axis of a shift.
+    that moves as is said. shift_sigma_px: std per axis of a shift. shifts_are_fitted: they
+      were found in these very frames, so that the frames agree with them better than others will.
     Raises TemplateError where the frames do not make a template, and says why.
     """
     stack = checked_frames(frames)
@@ -108,17 +121,45 @@ def learn_template(
         )
     near = None if centre_px is None else np.asarray(centre_px, float)
     found = moving_object(stack, shifts, radius_px, near)
-    candidates = [_learnt(stack, found, shifts, kind) for kind in _kinds(stack, found, shifts)]
-    best = min(candidates, key=lambda learnt: learnt.misfit)
-    return _checked(best, best.found, stack, shifts, shift_sigma_px)
+    seen = _begun(stack, found, shifts)
+    learnt = _learnt(seen, seen.channels)
+    if seen.channels is not None and learnt.unevenness > _MAGNITUDES:
+        others = _learnt(seen, None)
+        if learnt.unevenness > _NO_MAGNITUDES or others.misfit < learnt.misfit:
+            learnt = others
+    least = 1.0 if shifts_are_fitted else _LEAST_CHANCE
+    return _checked(learnt, seen.found, stack, shifts, shift_sigma_px, least)
+
+
+@dataclass(frozen=True, eq=False)
+class _Seen:
+    """The patches about the object, and a first account of it.
+
+    found: its origin moved to the middle of its outline. amplitudes (M,), surroundings (M, n, n) of
+    the patches. channels: of the magnitudes that the air speaks for; None for other pixels.
+    """
+
+    found: Moving
+    views: Views
+    mask: NDArray[np.bool_]
+    surroundings: Array
+    channels: float | None
+    air_power: float
 
 
 @dataclass(frozen=True, eq=False)
 class _Learnt:
-    image: ObjectImage
+    averaged: Averaged
     metric: Metric
-    found: Moving  # the object, its origin moved to the middle of its outline
-    misfit: float  # mean square of what is left of a frame that the template was not made from
+    misfit: float  # mean square of what the others leave of each frame
+
+    @property
+    def unevenness(self) -> float:
+        """How many times more noise there is at one level of the signal than at another.
+
+        Of magnitudes of some channels it is even: else something was done to them.
+        """
+        return float(self.metric.scales.max() / self.metric.scales.min())
 
 
 def _geometry(radius: float) -> tuple[float, int]:
@@ -135,16 +176,6 @@ def _patches(stack: Array, found: Moving, shifts: Array) -> tuple[Array, Array]:
     return patches, centres - whole
 
 
-def _kinds(stack: Array, found: Moving, shifts: Array) -> Sequence[NoiseKind]:
-    """Magnitudes show Rayleigh noise where there is no signal; what was processed does not."""
-    patches, _ = _patches(stack, found, shifts)
-    values = patches[:, _distance(patches.shape[1]) > _geometry(found.radius_px)[0]]
-    power = float(np.mean(values**2))
-    ratio = float(values.mean() ** 2 / power) if power > 0 else 0.0
-    is_air = values.min() >= 0 and abs(ratio - _AIR_RATIO[0]) < _AIR_RATIO[1]
-    return ("rician", "gaussian") if is_air else ("gaussian",)
-
-
 def _distance(size: int, offset: Array | None = None) -> Array:
     x = np.arange(size) - size // 2
     row, col = (0.0, 0.0) if offset is None else offset
@@ -158,113 +189,125 @@ def _window(size: int, offset: Array, reach: float) -> Array:
     return np.asarray(0.5 + 0.5 * np.cos(np.pi * share))
 
 
-def _learnt(stack: Array, found: Moving, shifts: Array, kind: NoiseKind) -> _Learnt:
+def _begun(stack: Array, found: Moving, shifts: Array) -> _Seen:
     patches, offsets = _patches(stack, found, shifts)
-    count, size = patches.shape[:2]
+    image = averaged_image(_views(patches, offsets, found)).image
+    middle = outline_middle(image, found.radius_px)  # what is round is so about its middle
+    found = replace(found, centre_px=found.centre_px + middle)
+    patches, offsets = _patches(stack, found, shifts)
+    views = _views(patches, offsets, found)
     reach = _geometry(found.radius_px)[0]
-    windows = np.array([_window(size, offset, reach) for offset in offsets])
-    mask = _distance(size) <= reach
-    far = _distance(size) > reach
-    air = patches[:, far]
+    mask = _distance(patches.shape[1]) <= reach
+    averaged = averaged_image(views)
+    metric = replace(Metric.white(mask, views.sigma, None), top=_top(averaged.shown, mask))
+    amplitudes, surroundings, _ = _levels_of(patches, averaged.shown, metric)
+    views = replace(views, patches=patches, amplitudes=amplitudes / amplitudes.mean())
+    air = patches[:, ~mask]
+    return _Seen(found, views, mask, surroundings, channels_of_air(air), float(np.mean(air**2)))
+
+
+def _views(patches: Array, offsets: Array, found: Moving) -> Views:
+    """The patches less the level about the object."""
+    size = patches.shape[1]
+    reach = _geometry(found.radius_px)[0]
+    air = patches[:, _distance(size) > reach]
     levels = np.median(air, axis=1)
     spread = 1.4826 * float(np.median(np.abs(air - levels[:, None])))
-    sigma = float(np.sqrt(np.mean(air**2) / 2)) if kind == "rician" else spread
-    sigma = max(sigma, 1e-6 * float(np.ptp(patches)), 1e-12)
-    surroundings = np.zeros_like(patches)
-    if kind == "gaussian":
-        surroundings = surroundings + levels[:, None, None]
-    views = Views(patches, offsets, windows, np.ones(count), sigma, np.ones((size, size)))
-    metric = Metric.white(mask, kind, sigma)
-    for number in range(_ROUNDS):
-        views = replace(views, patches=patches - surroundings, offsets_px=offsets)
-        if kind == "rician":
-            image = magnitude_image(views, found.radius_px)
-        else:
-            image = averaged_image(views)
-        if number < _ROUNDS - 1:  # what is round is so about its middle
-            middle, _ = absolute_centre(image, found.radius_px)
-            found = replace(found, centre_px=found.centre_px + middle)
-            offsets, image = offsets + middle, image.recentred(middle)
-        signals = np.array([image.at(offset)[0] for offset in offsets])
-        top = float(np.percentile(signals[:, mask], 97))
-        metric = replace(metric, top=max(top, 1e-12))
-        fits = [
-            linear_fit(patch[mask], signal[mask], metric, size)
-            for patch, signal in zip(patches, signals, strict=True)
-        ]
-        amplitudes = np.array([fit.amplitude for fit in fits])
-        if not np.all(amplitudes > 0.05 * np.median(amplitudes)) or amplitudes.mean() <= 0:
-            raise TemplateError(
-                "no common image: the frames do not show one object at the given displacements"
-            )
-        mean = float(amplitudes.mean())
-        image = replace(image, spectrum=image.spectrum * mean)
-        views = replace(views, amplitudes=amplitudes / mean)
-        if kind == "gaussian":
-            surroundings = np.array([fit.surroundings for fit in fits])
-        residuals = np.zeros_like(patches)
-        residuals[:, mask] = [fit.residual for fit in fits]
-        metric, power = _measured(metric, residuals, signals * mean, image.leverage)
-        views = replace(views, noise_power=power)
-        if kind == "gaussian":
-            views = replace(views, sigma=float(np.sqrt(np.mean(metric.variances))))
-    left = np.mean(residuals[:, mask] ** 2) / (1 - image.leverage) ** 2
-    return _Learnt(image, metric, found, float(left))
+    return Views(
+        patches=patches - levels[:, None, None],
+        offsets_px=offsets,
+        windows=np.array([_window(size, offset, reach) for offset in offsets]),
+        amplitudes=np.ones(len(patches)),
+        sigma=max(spread, 1e-6 * float(np.ptp(patches)), 1e-12),
+        noise_power=np.ones((size, size)),
+    )
 
 
-def _measured(
-    metric: Metric, residuals: Array, signals: Array, leverage: float
-) -> tuple[Metric, Array]:
-    """The metric with the noise that the residuals show, and the power spectrum of that noise."""
+def _top(images: Array, mask: NDArray[np.bool_]) -> float:
+    return max(float(np.percentile(images[:, mask], 97)), 1e-12)
+
+
+def _levels_of(patches: Array, shown: Array, metric: Metric) -> tuple[Array, Array, Array]:
+    """Amplitudes (M,), surroundings (M, n, n) and what is left (M, n, n) of the patches."""
     mask = metric.mask
-    size = len(mask)
-    n = int(mask.sum())
-    free = max(1 - leverage - 4 / n, 0.2)
-    top = float(np.percentile(signals[:, mask], 97))
-    squares = residuals[:, mask] ** 2 / free
-    if metric.kind == "rician":
-        metric = replace(metric, top=top, scale=1.0)
-        expected = np.array([metric.variance(signal[mask]) for signal in signals])
-        metric = replace(metric, scale=float(np.mean(squares / expected)))
-    else:
-        level = np.digitize(signals[:, mask] / top, _LEVELS)
-        overall = float(squares.mean())
-        variances = [
-            float(squares[level == i].mean()) if np.count_nonzero(level == i) > 30 else overall
-            for i in range(len(_LEVELS) + 1)
-        ]
-        floor = _LEAST_VARIANCE * overall + 1e-12 * top**2
-        metric = replace(metric, top=top, variances=np.maximum(variances, floor))
-    standard = np.zeros_like(residuals)
-    for one, signal, residual in zip(standard, signals, residuals, strict=True):
-        one[mask] = residual[mask] / np.sqrt(metric.variance(signal[mask]) * free)
-    table, error = lag_correlation(standard, mask, LAGS_PX)
-    table = believed(table, error / np.sqrt(free))
-    if np.count_nonzero(table) == 1:
-        return replace(metric, correlation=None, weights=None), np.ones((size, size))
-    matrix = correlation_matrix(table, mask)
-    metric = replace(metric, correlation=matrix, weights=weight_matrix(matrix))
-    return metric, _power(table, size)
+    fits = [
+        linear_fit(patch[mask], signal[mask], metric)
+        for patch, signal in zip(patches, shown, strict=True)
+    ]
+    amplitudes = np.array([fit.amplitude for fit in fits])
+    if not np.all(amplitudes > 0.05 * np.median(amplitudes)) or amplitudes.mean() <= 0:
+        raise TemplateError(
+            "no common image: the frames do not show one object at the given displacements"
+        )
+    left = np.zeros_like(patches)
+    left[:, mask] = [fit.residual for fit in fits]
+    return amplitudes, np.array([fit.surroundings for fit in fits]), left
 
 
-def _power(table: Array, size: int) -> Array:
-    reach = len(table) - 1
-    lags = np.zeros((size, size))
-    for i in range(-reach, reach + 1):
-        for j in range(-reach, reach + 1):
-            lags[i, j] = table[abs(i), abs(j)]
-    power = np.maximum(np.fft.fft2(lags).real, 0.05)
-    return np.asarray(power / power.mean())
+def _learnt(seen: _Seen, channels: float | None) -> _Learnt:
+    views, surroundings = seen.views, seen.surroundings
+    patches = views.patches
+    if channels is not None:
+        sigma = float(np.sqrt(seen.air_power / (2 * channels)))
+        views = replace(views, sigma=max(sigma, 1e-6 * float(np.ptp(patches)), 1e-12))
+    metric = Metric.white(seen.mask, views.sigma, channels)
+    start: NDArray[np.complex128] | None = None
+    for _ in range(_ROUNDS):
+        if channels is None:
+            averaged = averaged_image(replace(views, patches=patches - surroundings))
+        else:
+            averaged = magnitude_image(views, channels, seen.found.radius_px, start)
+        metric = replace(metric, top=_top(averaged.shown, seen.mask))
+        amplitudes, surroundings, left = _levels_of(patches, averaged.shown, metric)
+        mean = float(amplitudes.mean())
+        averaged = averaged.scaled(mean)
+        start = averaged.image.spectrum
+        metric = _measured(metric, left, averaged.shown, averaged.extra)
+        power = views.noise_power if metric.colour is None else metric.colour.power
+        views = replace(
+            views, amplitudes=amplitudes / mean, noise_power=np.maximum(power, _LEAST_NOISE)
+        )
+        if channels is None:
+            views = replace(views, sigma=float(np.sqrt(np.mean(metric.scales))))
+    return _Learnt(averaged, metric, float(np.mean(left[:, seen.mask] ** 2)))
+
+
+def _measured(metric: Metric, left: Array, shown: Array, extra: float) -> Metric:
+    """The metric with the noise that is left of frames when the others are taken away."""
+    mask = metric.mask
+    pixels = shown[:, mask]
+    metric = replace(metric, top=_top(shown, mask), scales=np.ones(3))
+    squares = left[:, mask] ** 2 / (metric.expected(pixels).variance * (1 + extra))
+    level = np.digitize(pixels / metric.top, _LEVELS)
+    prior = _LEVEL_PIXELS if metric.kind == "rician" else _LEAST_LEVEL_PIXELS
+    overall = float(squares.mean())
+    counts, sums = np.zeros(3), np.zeros(3)
+    for i in range(3):
+        counts[i], sums[i] = np.count_nonzero(level == i), squares[level == i].sum()
+    scales = (sums + prior * overall) / (counts + prior)
+    scales = np.maximum(scales, _LEAST_VARIANCE * overall + 1e-12 * metric.top**2)
+    metric = replace(metric, scales=scales)
+    standard = np.zeros_like(left)
+    standard[:, mask] = left[:, mask] / np.sqrt(metric.expected(pixels).variance)
+    taken = taken_by_fit(pixels.mean(axis=0), metric)
+    lost, table, error = lag_correlation(standard, Lags(mask, LAGS_PX), taken)
+    lags = believed(table, error)
+    colour = None if lags is None else Colour.of_lags(lags, len(mask))
+    return replace(metric, scales=scales * lost, colour=colour)
 
 
 def _weighings(metric: Metric) -> list[Metric]:
     """The ways to weigh the pixels: alike, and by their correlation where there is any."""
-    plain = replace(metric, weights=None)
-    return [plain] if metric.weights is None else [plain, metric]
+    return [metric] if metric.colour is None else [metric, replace(metric, is_weighed=True)]
 
 
 def _checked(
-    learnt: _Learnt, found: Moving, stack: Array, shifts: Array, shift_sigma_px: float
+    learnt: _Learnt,
+    found: Moving,
+    stack: Array,
+    shifts: Array,
+    shift_sigma_px: float,
+    least_widened: float,
 ) -> Template:
     """The template, with the weights that place its own frames best.
 
@@ -275,21 +318,27 @@ def _checked(
     errors: list[EngineError] = []
     for metric in _weighings(learnt.metric):
         try:
-            ways.append(_placed(learnt.image, metric, found, stack, shifts, shift_sigma_px))
+            ways.append(_placed(learnt.averaged, metric, found, stack, shifts, shift_sigma_px))
         except TemplateError:
             raise
         except EngineError as error:
             errors.append(error)
     if not ways:
         raise TemplateError(f"the frames do not show one object: {errors[0]}")
-    best = min(ways, key=lambda way: way.variance_px2)
+    best = ways[0]
+    for way in ways[1:]:
+        # weights whose promise the scatter keeps less well are not the noise's own
+        if way.variance_px2 < best.variance_px2 and way.chi2 < best.chi2:
+            best = way
     _refuse_scattered(best)
-    metric = replace(best.metric, widened=best.widened)
+    widened = max(least_widened, best.ratio)
+    metric = replace(best.metric, widened=widened)
     count = len(stack)
-    common = (best.mean_px2 * best.widened + np.eye(2) * shift_sigma_px**2) / count
-    middle, systematic = absolute_centre(learnt.image, found.radius_px)
+    common = (best.mean_px2 * widened + np.eye(2) * shift_sigma_px**2) / count
+    image = learnt.averaged.image
+    middle, systematic = absolute_centre(image, found.radius_px)
     return Template(
-        image=learnt.image,
+        image=image,
         metric=metric,
         reference_px=found.centre_px + middle,
         radius_px=found.radius_px,
@@ -302,7 +351,7 @@ def _checked(
 
 @dataclass(frozen=True, eq=False)
 class _Placed:
-    """The template's own frames, placed by it: how far apart from their displacements."""
+    """The template's own frames, each placed by the others: how far from their displacements."""
 
     metric: Metric
     apart_px: Array  # (M, 2) less the mean
@@ -314,19 +363,23 @@ class _Placed:
         return 2 * len(self.squares) - 2
 
     @property
-    def widened(self) -> float:
-        prior = 2 * _PRIOR_FRAMES
-        return max(1.0, float((prior + self.squares.sum()) / (prior + self.dof)))
+    def chi2(self) -> float:
+        """A degree of freedom."""
+        return float(self.squares.sum()) / self.dof
 
     @property
     def variance_px2(self) -> float:
+        return float(np.trace(self.mean_px2)) * self.ratio
+
+    @property
+    def ratio(self) -> float:
+        """Scatter over what is expected, 1 where there are few frames to tell it."""
         prior = 2 * _PRIOR_FRAMES
-        ratio = float((prior + self.squares.sum()) / (prior + self.dof))
-        return float(np.trace(self.mean_px2)) * ratio
+        return float((prior + self.squares.sum()) / (prior + self.dof))
 
 
 def _placed(
-    image: ObjectImage,
+    averaged: Averaged,
     metric: Metric,
     found: Moving,
     stack: Array,
@@ -335,21 +388,21 @@ def _placed(
 ) -> _Placed:
     fits = []
     for number, (frame, shift) in enumerate(zip(stack, shifts, strict=True)):
-        fit = fit_image(frame, image, metric, found.centre_px + shift)
+        fit = fit_image(frame, averaged.leaving_out(number), metric, found.centre_px + shift)
         if not fit.significance > _LEAST_SIGNIFICANCE:
             raise TemplateError(f"frame {number} does not show the same object as the others")
         fits.append(fit)
     apart = np.array([fit.centre_px for fit in fits]) - shifts - found.centre_px
     apart = apart - apart.mean(axis=0)
     covariances = np.array([fit.covariance_px2 for fit in fits])
-    # a frame draws the template after itself by its own share
-    expected = covariances * (1 - 1 / len(fits)) + np.eye(2) * shift_sigma_px**2
+    # what the others have in common is uncertain by the share of one of them
+    expected = (covariances + np.eye(2) * shift_sigma_px**2) * len(fits) / (len(fits) - 1)
     squares = np.einsum("ki,kij,kj->k", apart, np.linalg.inv(expected), apart)
     return _Placed(metric, apart, squares, np.asarray(covariances.mean(axis=0)))
 
 
 def _refuse_scattered(placed: _Placed) -> None:
-    scatter = float(placed.squares.sum()) / placed.dof
+    scatter = placed.chi2
     if not scatter < _MOST_SCATTER:
         worst = int(np.argmax(placed.squares))
         row, col = placed.apart_px[worst]

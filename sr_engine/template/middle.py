@@ -24,7 +24,7 @@ def absolute_centre(image: ObjectImage, radius_px: float) -> tuple[Array, Array]
     """Offset (row, col) px of the middle from the template's origin, and its systematic std."""
     fine = _twice_as_fine(image)
     half = len(fine) / 2
-    top = float(np.percentile(fine, 100 * (1 - 0.5 * np.pi * radius_px**2 / image.size**2)))
+    top = _plateau(fine, image.size, radius_px)
     estimates = []
     for level in _LEVELS:
         found = _centroid(fine > level * top)
@@ -41,6 +41,18 @@ def absolute_centre(image: ObjectImage, radius_px: float) -> tuple[Array, Array]
     middle = np.median(near, axis=0)
     spread = np.max(np.abs(np.array(near) - middle), axis=0)
     return np.asarray(middle), np.asarray(np.hypot(spread, _LEAST_PX))
+
+
+def outline_middle(image: ObjectImage, radius_px: float) -> Array:
+    """Offset (row, col) px of the outline's centroid from the template's origin."""
+    fine = _twice_as_fine(image)
+    found = _centroid(fine > 0.5 * _plateau(fine, image.size, radius_px))
+    offset = (np.zeros(2) if found is None else (found - len(fine) / 2)) / 2
+    return offset if float(np.hypot(*offset)) < _FARTHEST * radius_px else np.zeros(2)
+
+
+def _plateau(fine: Array, size: int, radius_px: float) -> float:
+    return float(np.percentile(fine, 100 * (1 - 0.5 * np.pi * radius_px**2 / size**2)))
 
 
 def _twice_as_fine(image: ObjectImage) -> Array:

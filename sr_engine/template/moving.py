@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_fill_holes, gaussian_filter, label, shift
+from scipy.ndimage import binary_fill_holes, gaussian_filter, label
 
 from sr_engine.errors import TemplateError
 
@@ -56,7 +56,15 @@ def moving_object(
 
 
 def _moved(image: Array, by_px: Array) -> Array:
-    return np.asarray(shift(image, by_px, order=1, mode="nearest"))
+    """Between pixels along straight lines; beyond the border as at it."""
+    for axis, by in enumerate(by_px):
+        whole = int(np.floor(by))
+        places = np.arange(image.shape[axis]) - whole
+        last = image.shape[axis] - 1
+        here = image.take(np.clip(places, 0, last), axis)
+        before = image.take(np.clip(places - 1, 0, last), axis)
+        image = here + (by - whole) * (before - here)
+    return image
 
 
 def _peak(frames: Array, shifts_px: Array, back: Array, together: Array) -> Array:

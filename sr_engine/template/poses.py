@@ -42,6 +42,7 @@ def learn_from_places(
             radius_px=radius_px,
             centre_px=places[0],
             shift_sigma_px=doubt_px,
+            shifts_are_fitted=True,
         )
         fits = [
             _fitted(template, number, frame, place + template.reference_px - places[0])

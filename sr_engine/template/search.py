@@ -1,12 +1,11 @@
 """Where in a frame the template's object is: normalised correlation with its image."""
 
 import numpy as np
+import scipy.fft
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
-from scipy.signal import oaconvolve
 
 from sr_engine.errors import AmbiguousObjectError, NoRoundObjectError
-from sr_engine.noise import moments
 from sr_engine.template.fit import Metric
 from sr_engine.template.image import ObjectImage
 
@@ -29,17 +28,14 @@ def find_object(
     """
     mask = metric.mask
     n = int(mask.sum())
-    model = np.where(mask, moments(image.at(np.zeros(2))[0], metric.sigma, metric.kind).mean, 0.0)
+    model = np.where(mask, metric.expected(image.at(np.zeros(2))[0]).mean, 0.0)
     model = np.where(mask, model - model[mask].mean(), 0.0)
     model /= np.linalg.norm(model)
     size = len(mask)
     padded = np.pad(frame - frame.mean(), size // 2, mode="edge")
-    flipped, window = model[::-1, ::-1], mask[::-1, ::-1].astype(float)
-    like = oaconvolve(padded, flipped, mode="valid")
-    total = oaconvolve(padded, window, mode="valid")
-    square = oaconvolve(padded**2, window, mode="valid")
+    like, total, square = _correlated(padded, model, mask.astype(float))
     spread = np.maximum(square - total**2 / n, 1e-9 * float(np.mean(padded**2)) * n + 1e-300)
-    likeness = (like / np.sqrt(spread))[: frame.shape[0], : frame.shape[1]]
+    likeness = like / np.sqrt(spread)
     if region is not None:
         r0, c0, r1, c1 = region
         inside = np.zeros(likeness.shape, dtype=bool)
@@ -62,3 +58,16 @@ def find_object(
             f"{row2:.0f} col {col2:.0f}: say where to look"
         )
     return places[0]
+
+
+def _correlated(padded: Array, model: Array, window: Array) -> tuple[Array, Array, Array]:
+    """Sums of pixels times model, of pixels, and of squares, in the window at every place."""
+    shape = padded.shape
+    full = tuple(scipy.fft.next_fast_len(n, real=True) for n in shape)
+    pixels, squares = scipy.fft.rfft2(np.stack([padded, padded**2]), full)
+    by_model, by_window = scipy.fft.rfft2(np.stack([model, window]), full).conj()
+    products = np.stack([pixels * by_model, pixels * by_window, squares * by_window])
+    sums = scipy.fft.irfft2(products, full)
+    rows, cols = (n - size // 2 * 2 for n, size in zip(shape, window.shape, strict=True))
+    like, total, square = sums[:, :rows, :cols]
+    return like, total, square

@@ -3,7 +3,7 @@
 import random
 from pathlib import Path
 
-from listener_room import mr_data_set
+from made_slices import mr_data_set
 from real_slices import DICOM
 
 # One of each encoding and layout; a few kilobytes each where there is a choice.

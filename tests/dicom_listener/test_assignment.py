@@ -6,7 +6,7 @@ from dataclasses import dataclass, field, replace
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from listener_room import CORONAL, a_slice
+from made_slices import CORONAL, a_slice
 from virtual_day import DELAYS, KNOWLEDGE, Trouble, VirtualDay
 
 from dicom_listener.assign import (

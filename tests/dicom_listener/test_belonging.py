@@ -3,7 +3,7 @@
 from dataclasses import replace
 
 import pytest
-from listener_room import a_slice, mr_data_set
+from made_slices import a_slice, mr_data_set
 
 from dicom_listener.assign import Assigned, AssignRules, HoldWindow, Known, Quarantined, assign
 from dicom_listener.belonging import (

@@ -9,7 +9,7 @@ from zoneinfo import ZoneInfo
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from listener_room import a_slice, mr_data_set
+from made_slices import a_slice, mr_data_set
 from pydicom import dcmread
 from pydicom.config import disable_value_validation
 from pydicom.dataelem import DataElement

@@ -4,7 +4,7 @@ import random
 
 import numpy as np
 import pytest
-from listener_room import a_slice
+from made_slices import a_slice
 from test_assignment import any_trouble
 from virtual_day import VirtualDay
 

@@ -4,7 +4,8 @@ import contextlib
 from collections.abc import Iterator
 
 import pytest
-from listener_room import listening, mr_data_set, wait_for, write_room
+from listener_room import listening, wait_for, write_room
+from made_slices import mr_data_set
 from pydantic import ValidationError
 from pydicom.dataset import Dataset
 from pynetdicom import AE, evt

@@ -5,7 +5,7 @@ import time
 
 import numpy as np
 import pytest
-from listener_room import begin_hold, mr_data_set
+from made_slices import begin_hold, mr_data_set
 from pydicom.dataset import Dataset
 from pydicom.uid import ImplicitVRLittleEndian, RLELossless
 from test_intake import Desk

@@ -1,6 +1,6 @@
 """Distortion-corrected slices and originals of one case are never mixed, whichever comes first."""
 
-from listener_room import a_slice
+from made_slices import a_slice
 
 from dicom_listener.assign import Assigned, AssignRules, HoldWindow, Known, Quarantined, assign
 from dicom_listener.clock import OffsetBounds

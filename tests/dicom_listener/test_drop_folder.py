@@ -5,7 +5,8 @@ import time
 from pathlib import Path
 
 import pytest
-from listener_room import COMPARED, begin_hold, listening, mr_data_set, wait_for, write_room
+from listener_room import COMPARED, listening, wait_for, write_room
+from made_slices import begin_hold, mr_data_set
 from pydicom import dcmread
 from pydicom.uid import RLELossless
 from test_listener_process import alarms, send

@@ -7,7 +7,8 @@ import subprocess
 from collections.abc import Iterator
 
 import pytest
-from listener_room import mr_data_set, needs_program, wait_for
+from listener_room import needs_program, wait_for
+from made_slices import mr_data_set
 from raw_pdus import (
     ABORT,
     RELEASE,

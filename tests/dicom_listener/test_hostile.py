@@ -14,7 +14,8 @@ import zlib
 from pathlib import Path
 
 import pytest
-from listener_room import mr_data_set, wait_for
+from listener_room import wait_for
+from made_slices import mr_data_set
 from pydicom.uid import DeflatedExplicitVRLittleEndian, ImplicitVRLittleEndian
 from test_intake import Desk
 from test_scp import associated, serving

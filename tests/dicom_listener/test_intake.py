@@ -5,7 +5,7 @@ import time
 from pathlib import Path
 
 import pytest
-from listener_room import begin_hold, mr_data_set
+from made_slices import begin_hold, mr_data_set
 from mangled import mangled
 from pydicom import dcmread
 from pydicom.dataset import Dataset

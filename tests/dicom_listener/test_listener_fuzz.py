@@ -6,7 +6,8 @@ import struct
 from pathlib import Path
 
 import pytest
-from listener_room import ListenerProcess, mr_data_set, wait_for, write_room
+from listener_room import ListenerProcess, wait_for, write_room
+from made_slices import mr_data_set
 from mangled import mangled, sources
 from pynetdicom import AE
 from pynetdicom.pdu import A_ASSOCIATE_RQ

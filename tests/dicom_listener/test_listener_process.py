@@ -16,15 +16,8 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
-from listener_room import (
-    COMPARED,
-    ListenerProcess,
-    begin_hold,
-    listening,
-    mr_data_set,
-    wait_for,
-    write_room,
-)
+from listener_room import COMPARED, ListenerProcess, listening, wait_for, write_room
+from made_slices import begin_hold, mr_data_set
 from pydicom.uid import ExplicitVRLittleEndian
 from pynetdicom import AE, evt
 from pynetdicom.association import Association

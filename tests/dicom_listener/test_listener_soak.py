@@ -6,7 +6,8 @@ import time
 from pathlib import Path
 
 import pytest
-from listener_room import ListenerProcess, mr_data_set, wait_for, write_room
+from listener_room import ListenerProcess, wait_for, write_room
+from made_slices import mr_data_set
 from pydicom.uid import ExplicitVRLittleEndian
 from pynetdicom import AE
 

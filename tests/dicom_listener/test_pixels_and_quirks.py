@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from listener_room import a_slice, mr_data_set
+from made_slices import a_slice, mr_data_set
 from pydicom import dcmread
 from pydicom.uid import DeflatedExplicitVRLittleEndian, ExplicitVRLittleEndian
 from real_slices import DICOM

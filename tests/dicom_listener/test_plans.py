@@ -17,7 +17,7 @@ from highdicom.sr import (
     PersonObserverIdentifyingAttributes,
     TrackingIdentifier,
 )
-from listener_room import begin_hold, mr_data_set
+from made_slices import begin_hold, mr_data_set
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.sr.codedict import codes
 from pydicom.uid import ExplicitVRLittleEndian, generate_uid

@@ -7,7 +7,7 @@ import time
 from pathlib import Path
 
 import pytest
-from listener_room import begin_hold, mr_data_set
+from made_slices import begin_hold, mr_data_set
 
 from case_record.cases import Cases
 from case_record.record import CaseRecord

@@ -4,7 +4,7 @@ import time
 from typing import Any
 
 import pytest
-from listener_room import mr_data_set
+from made_slices import mr_data_set
 from pydicom.uid import ExplicitVRLittleEndian
 from pynetdicom import AE, evt
 from pynetdicom.association import Association

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from listener_room import begin_hold, mr_data_set
+from made_slices import begin_hold, mr_data_set
 from pydicom.dataset import Dataset
 
 from case_record.record import CaseRecord

@@ -17,7 +17,8 @@ from pathlib import Path
 import httpx
 import pytest
 import trustme
-from listener_room import mr_data_set, needs_program, wait_for
+from listener_room import needs_program, wait_for
+from made_slices import mr_data_set
 from pydicom import dcmread
 from pydicom.uid import UID, ExplicitVRBigEndian, ExplicitVRLittleEndian, JPEGLosslessSV1
 from pynetdicom import AE, StoragePresentationContexts

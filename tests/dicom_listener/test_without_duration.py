@@ -4,7 +4,7 @@ import time
 
 import numpy as np
 import pytest
-from listener_room import begin_hold, mr_data_set
+from made_slices import begin_hold, mr_data_set
 from real_slices import DICOM, manifest
 from test_intake import Desk
 

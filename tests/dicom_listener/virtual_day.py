@@ -13,7 +13,7 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from listener_room import a_slice
+from made_slices import a_slice
 
 from dicom_listener.assign import Assigned, AssignRules, HoldWindow, Known, assign
 from dicom_listener.clock import (

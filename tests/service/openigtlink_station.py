@@ -86,7 +86,7 @@ class Station(ABC):
         self, wanted: Callable[[Mapping[str, Any]], Any], since: int = 0, timeout_s: float = 60.0
     ) -> dict[str, Any]:
         """The first message since a mark that is as wanted."""
-        deadline_s = time.monotonic() + timeout_s
+        deadline_s, begun = time.monotonic() + timeout_s, since
         with self._changed:
             while True:
                 for message in self.heard[since:]:
@@ -94,7 +94,8 @@ class Station(ABC):
                         return message
                 since = len(self.heard)
                 left_s = deadline_s - time.monotonic()
-                assert self._changed.wait(max(0.0, left_s)), f"not heard: {self.heard[-8:]}"
+                others = [m for m in self.heard[begun:] if m["device"] != "AutoSPINe"]
+                assert self._changed.wait(max(0.0, left_s)), f"not heard, but {others[-8:]}"
 
     def next_beats(self, number: int = 2) -> None:
         """Until the room has said so often more what is going on: once a second, and before

@@ -225,7 +225,8 @@ def test_a_case_that_has_ended_leaves_nothing_behind_even_if_it_is_opened_again(
         room.call("puncture")
         room.call("needle_out")
         assert room.later().error is not None
-        room.call("finish_case")
+        room.call("finish_case", park=True)
+        assert room.line.stage.parked
         state = room.later()
         assert not state.ready
         for shown in (
@@ -420,12 +421,19 @@ def test_a_motion_that_was_interrupted_is_not_made_again(room, answer):
     assert len(room.line.stage.begun) == begun
 
 
-def test_after_an_interruption_between_moves_only_a_new_order_moves_the_robot(room):
+def lose_power(room):
+    """The controllers, while nobody wants anything of them: they know no position any more."""
+    room.do(room.line.motors._certain.clear)
+    room.until(lambda s: not s.robot.position_certain)
+
+
+@pytest.mark.parametrize("interrupted", [lose_link_for_a_while, lose_power])
+def test_after_an_interruption_between_moves_only_a_new_order_moves_the_robot(room, interrupted):
     room.arm()
     room.do(lambda: setattr(room, "scanning", False))
     room.call("start_calibration")
     room.until(lambda s: s.acquisition_request is not None)
-    lose_link_for_a_while(room)
+    interrupted(room)
     room.arm()
     begun, asked = len(room.line.stage.begun), []
     room.do(lambda: setattr(room, "scanning", True))

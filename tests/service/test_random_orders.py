@@ -276,6 +276,7 @@ def campaign(folder, seed, orders, monkeypatch):
     monkey = Monkey(room, seed, lambda by: step.__setitem__(0, by))
     room.loop.start()
     try:
+        room.arm()
         monkey.run(orders)
     finally:
         room.loop.close()

@@ -9,6 +9,7 @@ from service.procedure.initial_estimate import POSITION_DECLARED
 from service.procedure.plan import PlanRefusedError, check_travel
 from service.procedure.registry import JOG
 from service.room.context import RoomContext
+from service.room.going_on import ARMED
 from service.room.present import NEEDLE_OUT
 from service.room.readiness import ConflictError
 from service.room.robot.whereabouts import in_words, taken_to_stand
@@ -38,7 +39,8 @@ class RobotCommands:
         except BridgeError as error:
             raise ConflictError("robot_refused", str(error)) from error
         self._room.stops.release(pressed)
-        self._room.note("armed", by, {})
+        if not (status.armed and status.position_certain):
+            self._room.note(ARMED, by, {})
 
     def _declare(self, status: BridgeStatus, by: str, said_um: Mapping[str, int] | None) -> None:
         """What the operator said of the axes that are not certain; where that is only what the
