@@ -4,16 +4,16 @@ import re
 
 import pytest
 from attended_room import AttendedRoom, arm, calibrated, stop_all, wait_for
-from browser import laid_out
+from browser import laid_out, set_theme, violations
 from lone_service import running_service
-from page_states import LONG, SIZES, layout_faults_at_all_sizes, not_in_one_glance, states
+from page_states import LONG, SIZES, THEMES, layout_faults_at_all_sizes, not_in_one_glance, states
 from playwright.sync_api import Browser, Page, expect
 
 from service.client import RoomClient
 from service.web.access import new_token, token_hash
 
 
-def test_nothing_is_cut_or_scrolls_by_itself_or_lies_under_stop_in_any_state_at_any_size(
+def test_nothing_is_cut_or_scrolls_by_itself_or_lies_under_stop_or_is_hard_to_read_in_any_state(
     page: Page, client: RoomClient
 ) -> None:
     wrong = {}
@@ -23,6 +23,11 @@ def test_nothing_is_cut_or_scrolls_by_itself_or_lies_under_stop_in_any_state_at_
             expect(page.locator("#room")).to_have_text(re.compile(rf" {name}$"))
             if faults := faults_of(page):
                 wrong[f"{state}, {name[:8]}"] = faults
+        page.set_viewport_size({"width": 1280, "height": 800})
+        for theme in THEMES:
+            set_theme(page, theme)
+            if found := violations(page):
+                wrong[f"{state}, {theme}"] = found
     assert not wrong
 
 
