@@ -102,6 +102,8 @@ class Execution:
     def answer(self, choice: str, who: str) -> None:
         self._answer = Answered(choice, who)
         self.question = None  # at once: nobody sees or answers it a second time
+        if choice == CONFIRM and self._link.status is not None:
+            self._permitted.confirm(self._link.status)
 
     def abort(self, reason: str) -> None:
         """End the running procedure at its next look; nothing if none runs."""
@@ -440,8 +442,6 @@ class Execution:
         while self._answer is None:
             self._wait()
         self.question = None
-        if self._answer.choice == CONFIRM and self._link.status is not None:
-            self._permitted.give(self._link.status)
         return self._answer
 
     def _wait(self) -> None:
