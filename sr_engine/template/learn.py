@@ -51,6 +51,7 @@ _MOST_SCATTER = 12.0  # chi2 a degree of freedom of the displacements: more is n
 _LEAST_NOISE = 0.05  # of the noise power at any frequency: none is without
 _PRIOR_FRAMES = 10.0  # what the pixels' own account of the noise weighs, in frames
 _LEAST_VARIANCE = 0.1  # of a level's noise, over that of all: denoised air is not sure
+_LEAST_SLOPE = 2e-4  # of the highest signal, a pixel: surroundings are never quite even
 _LEAST_SIGNIFICANCE = 8.0  # of the amplitude
 
 
@@ -200,7 +201,7 @@ def _begun(stack: Array, found: Moving, shifts: Array) -> _Seen:
     mask = _distance(patches.shape[1]) <= reach
     averaged = averaged_image(views)
     metric = replace(Metric.white(mask, views.sigma, None), top=_top(averaged.shown, mask))
-    amplitudes, surroundings, _ = _levels_of(patches, averaged.shown, metric)
+    amplitudes, surroundings, *_ = _levels_of(patches, averaged.shown, metric)
     views = replace(views, patches=patches, amplitudes=amplitudes / amplitudes.mean())
     air = patches[:, ~mask]
     return _Seen(found, views, mask, surroundings, channels_of_air(air), float(np.mean(air**2)))
@@ -227,8 +228,9 @@ def _top(images: Array, mask: NDArray[np.bool_]) -> float:
     return max(float(np.percentile(images[:, mask], 97)), 1e-12)
 
 
-def _levels_of(patches: Array, shown: Array, metric: Metric) -> tuple[Array, Array, Array]:
-    """Amplitudes (M,), surroundings (M, n, n) and what is left (M, n, n) of the patches."""
+def _levels_of(patches: Array, shown: Array, metric: Metric) -> tuple[Array, Array, Array, float]:
+    """Amplitudes (M,), surroundings (M, n, n), what is left (M, n, n) of the patches, and the
+    slopes of the surroundings, std relative to the highest signal."""
     mask = metric.mask
     fits = [
         linear_fit(patch[mask], signal[mask], metric)
@@ -241,7 +243,9 @@ def _levels_of(patches: Array, shown: Array, metric: Metric) -> tuple[Array, Arr
         )
     left = np.zeros_like(patches)
     left[:, mask] = [fit.residual for fit in fits]
-    return amplitudes, np.array([fit.surroundings for fit in fits]), left
+    slopes = np.mean([np.mean(fit.slopes**2) - fit.slope_variance for fit in fits])
+    slope = max(float(np.sqrt(max(slopes, 0.0))) / metric.top, _LEAST_SLOPE)
+    return amplitudes, np.array([fit.surroundings for fit in fits]), left, slope
 
 
 def _learnt(seen: _Seen, channels: float | None) -> _Learnt:
@@ -258,7 +262,8 @@ def _learnt(seen: _Seen, channels: float | None) -> _Learnt:
         else:
             averaged = magnitude_image(views, channels, seen.found.radius_px, start)
         metric = replace(metric, top=_top(averaged.shown, seen.mask))
-        amplitudes, surroundings, left = _levels_of(patches, averaged.shown, metric)
+        amplitudes, surroundings, left, slope = _levels_of(patches, averaged.shown, metric)
+        metric = replace(metric, slope=slope)
         mean = float(amplitudes.mean())
         averaged = averaged.scaled(mean)
         start = averaged.image.spectrum
