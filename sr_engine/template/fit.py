@@ -40,8 +40,8 @@ class Metric:
     mask (n, n): pixels of the patch that count. kind "rician": magnitudes of so many channels, of
     noise std sigma each; "gaussian": other pixels. scales (3,): variance of air, edge and plateau,
     top being its level, over that of the magnitudes, or as it is. slope: std of the surroundings'
-    slopes, of top a pixel. colour: correlation of the
-    noise, None where it is white; is_weighed: whether the fit heeds it. widened: factor of the
+    slopes, of top a pixel. colour: correlation of the noise at the object's edge, None where it is
+    white; weighing: of all pixels, where the fit heeds it. widened: factor of the
     covariance.
     """
 
@@ -53,7 +53,7 @@ class Metric:
     top: float = 1.0
     slope: float = SLOPE_SCALES[0]
     colour: Colour | None = None
-    is_weighed: bool = False
+    weighing: Colour | None = None
     widened: float = 1.0
 
     @classmethod
@@ -75,9 +75,7 @@ class Metric:
 
     def weighed(self, rows: Array) -> Array:
         """(c, p) rows, as the fit weighs them."""
-        if self.colour is None or not self.is_weighed:
-            return rows
-        return self.colour.weighed(rows.T, self.mask).T
+        return rows if self.weighing is None else self.weighing.weighed(rows.T, self.mask).T
 
     @cached_property
     def places(self) -> tuple[Array, Array]:
