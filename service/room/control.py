@@ -50,7 +50,7 @@ from service.room.state_view import Describer, ProcessLook, describe_robot
 from service.room.stop_latch import StopLatch
 from service.room.trouble import RECORD_FAULTS, Trouble, held
 
-_TICK_S = 0.002
+_TICK_S = 0.01
 _HOLD_TICK_S = 0.02
 _TRIED_AGAIN_S = 0.5
 _SAID_AGAIN_S = 60.0
