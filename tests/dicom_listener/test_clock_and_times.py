@@ -108,8 +108,31 @@ def test_a_reference_far_from_its_acquisition_makes_the_interval_cover_both():
             FrameAcquisitionDuration=1000.0,
         )
     )
-    assert found.start_s == at("2024-01-10T12:00:10+01:00")
+    assert found.start_s == at("2024-01-10T12:00:09+01:00")
     assert found.end_s == at("2024-01-10T13:00:01+01:00")
+
+
+@pytest.mark.parametrize(
+    "timing", [{}, {"RepetitionTime": "50", "NumberOfPhaseEncodingSteps": "64"}]
+)
+def test_a_reference_in_an_acquisition_of_uncertain_duration_is_no_start(timing):
+    data_set = frame_times(FrameReferenceDateTime="20240110120010")
+    for name, value in timing.items():
+        setattr(data_set, name, value)
+    with pytest.raises(ImplausibleTimeError, match="acquisition of unknown duration"):
+        interval_of(data_set)
+    data_set.AcquisitionDateTime = "20240110120020"  # no start of it, for it comes after
+    with pytest.raises(ImplausibleTimeError, match="no start before it"):
+        interval_of(data_set)
+    data_set.AcquisitionDate, data_set.AcquisitionTime = "20240110", "120001"
+    found = interval_of(data_set)
+    assert found.source == "AcquisitionDate+AcquisitionTime"
+    assert found.start_s == at("2024-01-10T12:00:01+01:00")
+    data_set.AcquisitionDateTime = "20240110120000"
+    found = interval_of(data_set)
+    assert found.source == "AcquisitionDateTime"
+    assert found.start_s == at("2024-01-10T12:00:00+01:00")
+    assert found.end_s is None or found.end_s >= at("2024-01-10T12:00:10+01:00")
 
 
 def test_a_duration_is_taken_from_the_header_or_estimated_and_marked_so():

@@ -2,6 +2,7 @@
 
 import os
 import time
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -141,6 +142,24 @@ def test_files_that_may_have_lain_there_bear_no_witness_to_promptness(make_desk,
         desk.receive(sent, received_s=now_s - 39 + 8 * place, is_fresh=is_fresh)
     states = {row.state for row in desk.record.slices()}
     assert states == ({"assigned"} if is_fresh else {"pending"})
+
+
+@pytest.mark.parametrize("says_start", [True, False])
+def test_a_reference_within_the_hold_does_not_hide_a_start_before_it(make_desk, says_start):
+    desk = make_desk(clock=ClockRules(unseen_steps=False))
+    now_s = time.time()
+    begin_hold(desk.record, now_s - 12)
+    sent = enhanced(1, now_s - 20)
+    del sent.AcquisitionDuration
+    if not says_start:
+        del sent.AcquisitionDateTime
+    content = Dataset()
+    content.FrameReferenceDateTime = f"{datetime.fromtimestamp(now_s - 10):%Y%m%d%H%M%S.%f}"
+    sent.PerFrameFunctionalGroupsSequence[0].FrameContentSequence = Sequence([content])
+    (row,) = desk.receive(sent)
+    assert row.state == "quarantined"
+    assert ("before" if says_start else "unknown duration") in row.reason
+    assert row.time_source == ("AcquisitionDateTime" if says_start else "")
 
 
 def test_every_frame_of_one_object_is_a_slice_of_the_hold(make_desk):
