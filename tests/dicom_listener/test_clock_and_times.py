@@ -21,12 +21,11 @@ from dicom_listener.clock import (
     Comparison,
     OffsetBounds,
     OffsetUnknown,
-    Promptness,
     Received,
     ScannerClock,
     observe,
 )
-from dicom_listener.promptness import TooFewDelaysError, promptness_of
+from dicom_listener.promptness import Promptness, TooFewDelaysError, promptness_of
 from dicom_listener.scanner_clocks import Drift, ScannerClocks
 from dicom_slice.elements import Elements, frame_elements
 from dicom_slice.header import slices_of
@@ -297,7 +296,7 @@ def test_slices_that_were_held_up_do_not_agree_and_are_not_believed():
         clock = after(clock, slice_, rules=MEASURED)
     unknown = clock.bounds_for(slice_, MEASURED)
     assert isinstance(unknown, OffsetUnknown)
-    assert "no 5 slices arrived as promptly as was measured at this site" in unknown.text
+    assert "no 5 acquisitions arrived, each for itself, as promptly as was measured" in unknown.text
 
 
 def test_with_comparison_and_promptness_an_acquisition_must_be_good_by_both():
