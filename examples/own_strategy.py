@@ -5,7 +5,8 @@ python examples/own_strategy.py
 
 import numpy as np
 
-from service.procedure.approach import ApproachArguments, approach
+from service.procedure.aim import ApproachArguments
+from service.procedure.approach import approach
 from service.procedure.calibration import CalibrationArguments, calibrate
 from service.procedure.observe import ValidationGate
 from service.procedure.strategies import STRATEGIES, Imaging, Strategy

@@ -303,9 +303,9 @@ class RoomClient:
         answer = self._order("POST", "/api/v1/cases", label=label, operator=operator, note=note)
         return CaseBegun.model_validate_json(answer.text).folder
 
-    def finish_case(self) -> str:
-        """Return the name of the finished case's folder."""
-        answer = self._order("POST", "/api/v1/case/finish")
+    def finish_case(self, *, park: bool = False) -> str:
+        """Return the name of the finished case's folder. park: the drives as well."""
+        answer = self._order("POST", "/api/v1/case/finish", park=park)
         return CaseBegun.model_validate_json(answer.text).folder
 
     def continue_case(self) -> None:

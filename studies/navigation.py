@@ -11,7 +11,8 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from service.procedure.approach import PAPER, PROBABILITY, ApproachArguments, Arrival, approach
+from service.procedure.aim import PAPER, PROBABILITY, ApproachArguments
+from service.procedure.approach import Arrival, approach
 from service.procedure.calibration import Calibration, CalibrationArguments, calibrate
 from service.procedure.observe import ProcedureFailedError, ValidationGate, move
 from service.procedure.recording import RecordingArguments, record_place

@@ -6,7 +6,7 @@ import json
 import math
 import secrets
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from robot_bridge.client.client import (
@@ -76,6 +76,8 @@ def _fresh_health(path: Path) -> dict[str, object] | None:
     try:
         health = json.loads(path.read_text(encoding="utf-8"))
         fresh = time.time() - float(health["t"]) < STATUS_FILE_FRESH_S
+        whereabouts = ("positions_um", "certain_axes", "remembered_um", "bound_um")
+        health["positions_um"] = _positions(*(health[name] for name in whereabouts))
     except (OSError, ValueError, KeyError, TypeError):
         return None
     return health if fresh and health.get("exit_reason") is None else None
@@ -91,7 +93,9 @@ def _status_fields(status: BridgeStatus) -> dict[str, object]:
         "insertion_locked": status.insertion_locked,
         "moving": status.moving,
         "parked": status.parked,
-        "positions_um": _positions(status),
+        "positions_um": _positions(
+            status.positions_um, status.certain_axes, status.remembered_um, status.bound_um
+        ),
         "position_certain": status.position_certain,
         "fault": status.fault,
         "last_command": status.command_id,
@@ -99,16 +103,19 @@ def _status_fields(status: BridgeStatus) -> dict[str, object]:
     }
 
 
-def _positions(status: BridgeStatus) -> dict[str, object]:
+def _positions(
+    counted_um: Mapping[str, int],
+    certain_axes: Collection[str],
+    remembered_um: Mapping[str, int],
+    bound_um: Mapping[str, int],
+) -> dict[str, object]:
     """What is not known is not shown as a number."""
     shown: dict[str, object] = {}
-    for axis, at_um in status.positions_um.items():
-        if axis in status.certain_axes:
+    for axis, at_um in counted_um.items():
+        if axis in certain_axes:
             shown[axis] = at_um
-        elif axis in status.remembered_um:
-            shown[axis] = (
-                f"unknown, assumed {status.remembered_um[axis]} +- {status.bound_um[axis]}"
-            )
+        elif axis in remembered_um:
+            shown[axis] = f"unknown, assumed {remembered_um[axis]} +- {bound_um[axis]}"
         else:
             shown[axis] = "unknown"
     return shown

@@ -32,13 +32,15 @@ function finishCase() {
   const box = h("div", { class: "finish-case" });
   const closed = () => replace(box, h("button", { type: "button", class: "plain", onclick: opened }, T.finish));
   const opened = () => {
+    const park = h("input", { type: "checkbox" });
     const finish = h("button", {
       type: "button", disabled: true,
-      onclick: () => act(() => order("POST", "api/v1/case/finish")),
+      onclick: () => act(() => order("POST", "api/v1/case/finish", { park: park.checked })),
     }, T.finishNow);
     setTimeout(() => { finish.disabled = false; }, READ_FIRST_MS);
     replace(box,
       h("p", {}, T.finishWhy),
+      h("p", {}, h("label", {}, park, " ", T.park)),
       h("p", {}, h("button", { type: "button", onclick: closed }, T.notYet), " ", finish));
   };
   closed();

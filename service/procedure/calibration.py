@@ -10,45 +10,49 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import pairwise
-from typing import Any, Protocol, TypeVar
+from typing import Any
 
 import numpy as np
-from scipy.linalg import block_diag
 
+from robot_bridge.protocol.phases import WorkPhase
 from service.procedure.estimate import FiducialEstimate, MotionNoise
+from service.procedure.fiducials import ONE_FIDUCIAL, Geometry
 from service.procedure.jacobian import CalibrationError, ImageJacobian
 from service.procedure.observe import (
     ML,
     TEMPLATE,
     Expectation,
     ProcedureFailedError,
+    Seen,
+    Templates,
     ValidationGate,
     check_prediction,
     estimate_from,
-    measure_here,
-    measure_shift_set,
-    measure_step,
     move,
+    see,
+    see_again,
 )
 from service.procedure.plane import ImagePlane
-from service.procedure.steps import HoldShift, Measured, MoveTo, ProcedureSteps, ask
+from service.procedure.shift_set import measure_shift_set
+from service.procedure.steps import Measured, MoveTo, ProcedureSteps
 
 DISC = "disc"
 _ASYMMETRY_CHECK_SIGMA = 5.0
 # twice what the directions of an axis are taken to differ by: a stage that was driven into its stop
 # comes back further than it went out
 _LARGEST_ASYMMETRY = 0.10
-Templates = tuple[tuple[int, ...], ...]
 
 
 @dataclass(frozen=True)
 class CalibrationArguments:
     """last: this robot's last image Jacobian; same_mount: it was not mounted anew since.
 
+    axes: two of a fiducial; of the guide the top stage's two, then the bottom stage's. shifts_px:
+    with more than one, of one fiducial, it is measured once more with them at the end.
     localization: what is fitted once the fiducial was seen: its own image ("template") or "disc".
     """
 
-    axes: tuple[str, str]
+    axes: tuple[str, ...]
     origin_um: Mapping[str, int]
     move_um: int
     shifts_px: tuple[tuple[float, float], ...]
@@ -57,6 +61,7 @@ class CalibrationArguments:
     last: Mapping[str, Any] | None = None
     same_mount: bool = False
     localization: str = DISC
+    geometry: Geometry = ONE_FIDUCIAL
 
 
 @dataclass(frozen=True)
@@ -113,9 +118,6 @@ class Calibration:
     measurement_id: int
     found_by: FoundBy = BY_DISC
 
-    def template_of(self, fiducial: int = 0) -> tuple[int, ...]:
-        return self.found_by.template_of(fiducial)
-
     def to_json(self) -> dict[str, Any]:
         return {
             "jacobian": self.jacobian.to_json(),
@@ -136,85 +138,73 @@ class Calibration:
         )
 
 
-class Seen(Protocol):
-    """What one look of a calibration gives, of one fiducial or of two."""
-
-    @property
-    def measurement_id(self) -> int: ...
-
-    @property
-    def plane(self) -> ImagePlane: ...
-
-    @property
-    def all_measured(self) -> tuple[Measured, ...]:
-        """Of each fiducial."""
-
-    def at(self, setpoints_um: Mapping[str, int]) -> FiducialEstimate: ...
-
-
-@dataclass(frozen=True, eq=False)
-class OneSeen:
-    """One fiducial at one hold."""
-
-    measured: Measured
-    hold_id: int
-
-    @property
-    def all_measured(self) -> tuple[Measured, ...]:
-        return (self.measured,)
-
-    @property
-    def measurement_id(self) -> int:
-        return self.measured.measurement_id
-
-    @property
-    def plane(self) -> ImagePlane:
-        return ImagePlane.from_json(self.measured.plane)
-
-    def at(self, setpoints_um: Mapping[str, int]) -> FiducialEstimate:
-        return estimate_from(self.measured, setpoints_um)
-
-
-SeenThere = TypeVar("SeenThere", bound=Seen)
-# of the place before and, where there is one, of the prediction for this place
-LookThere = Callable[[FiducialEstimate | None, FiducialEstimate | None], ProcedureSteps[SeenThere]]
-# at what was seen last, expected there, by the measurements that show each fiducial
-LookByTemplate = Callable[
-    [SeenThere, FiducialEstimate, Templates], ProcedureSteps[tuple[Measured, ...]]
-]
-
-
 def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
-    """Run the calibration; raises ProcedureFailedError when the moves do not explain the images."""
+    """Move every axis once, and all of them back; learn how the fiducials follow.
 
-    def look(
-        before: FiducialEstimate | None, predicted: FiducialEstimate | None
-    ) -> ProcedureSteps[OneSeen]:
-        expectation = _expectation(before, predicted, arguments)
-        by_template = arguments.localization == TEMPLATE and arguments.method == ML
-        acquired, measured = yield from measure_here(
-            arguments.method, expectation, any_shape=by_template
+    Raises ProcedureFailedError when the moves do not explain the images. The last place is the way
+    back: the image Jacobian must be a possible one before it is driven, and what is seen there must
+    be what was predicted.
+    """
+    gate = _gate_of_way_back(arguments)
+    places = _places(arguments)
+    learnt = unknown = ImageJacobian.unknown(arguments.axes)
+    stops: list[FiducialEstimate] = []
+    looks: list[Seen] = []
+    for number, setpoints_um in enumerate(places, 1):
+        last = number == len(places)
+        if last:
+            _check(arguments, learnt)
+        purpose = f"calibration {number}/{len(places)}"
+        moved = yield from move(MoveTo(setpoints_um, purpose, phase=WorkPhase.CALIBRATION))
+        predicted = stops[-1].moved_to(moved.readback_um, learnt, gate.noise) if last else None
+        looks.append((yield from _look(arguments, stops, predicted)))
+        _check_plane(looks)
+        here = looks[-1].at(moved.readback_um)
+        if predicted is not None:
+            check_prediction(predicted, here, gate)
+        if stops:
+            learnt = learn_from_move(learnt, stops[-1], here, gate.noise)
+        stops.append(here)
+    known = Calibration(learnt, stops[-1], looks[0].plane, looks[-1].measurement_id)
+    if arguments.localization == TEMPLATE:
+        known, stops = yield from _by_template(arguments, known, stops, looks)
+        known = replace(known, jacobian=_learn_again(unknown, stops, gate))
+    _check(arguments, known.jacobian)
+    _refuse(lambda: _check_there_and_back(known.jacobian, stops[0], stops[-1], places))
+    check_is_as_last(known, arguments.last, arguments.gate, same_mount=arguments.same_mount)
+    return (yield from _refine(known, arguments))
+
+
+def _gate_of_way_back(arguments: CalibrationArguments) -> ValidationGate:
+    """With two axes what the directions of an axis may differ by is known, whatever is set."""
+    if len(arguments.axes) > 2:
+        return arguments.gate
+    return replace(arguments.gate, gate_sigma=_ASYMMETRY_CHECK_SIGMA)
+
+
+def _look(
+    arguments: CalibrationArguments,
+    stops: Sequence[FiducialEstimate],
+    predicted: FiducialEstimate | None,
+) -> ProcedureSteps[Seen]:
+    geometry, gate = arguments.geometry, arguments.gate
+    expected: Sequence[Expectation | None] = [None] * len(geometry.names)
+    if predicted is not None:
+        expected = gate.around(predicted)
+    elif stops:
+        # which way the axis points in the image is not known yet: anywhere around the last place
+        reach_mm = geometry.reach_mm(abs(arguments.move_um), gate.position_gate_mm)
+        before = stops[-1]
+        expected = [Expectation(before.plane_mm[one], reach_mm) for one in before.each]
+    any_shape = arguments.localization == TEMPLATE and arguments.method == ML
+    return (yield from see(geometry, arguments.method, expected, any_shape=any_shape))
+
+
+def _check_plane(looks: Sequence[Seen]) -> None:
+    if not looks[-1].plane.is_parallel_to(looks[0].plane):
+        raise ProcedureFailedError(
+            "plane_changed", "the slice orientation changed during the procedure: rescan as before"
         )
-        return OneSeen(measured, acquired.hold_id)
-
-    def look_by_template(
-        last: OneSeen, expected: FiducialEstimate, templates: Templates
-    ) -> ProcedureSteps[tuple[Measured, ...]]:
-        holds = (HoldShift(last.hold_id, (0.0, 0.0)),)
-        expectation = arguments.gate.around(expected)
-        step = measure_step(holds, arguments.method, expectation, template=templates[0])
-        return ((yield from ask(step, Measured)),)
-
-    found = yield from drive_and_learn(
-        _places(arguments),
-        ImageJacobian.unknown(arguments.axes),
-        replace(arguments.gate, gate_sigma=_ASYMMETRY_CHECK_SIGMA),
-        look,
-        _check,
-        look_by_template if arguments.localization == TEMPLATE else None,
-    )
-    check_is_as_last(found, arguments.last, arguments.gate, same_mount=arguments.same_mount)
-    return (yield from _refine(found, arguments))
 
 
 def check_is_as_last(
@@ -229,91 +219,49 @@ def check_is_as_last(
     )
 
 
-def drive_and_learn(
-    places: Sequence[Mapping[str, int]],
-    jacobian: ImageJacobian,
-    gate: ValidationGate,
-    look: LookThere[SeenThere],
-    check: Callable[[ImageJacobian], None],
-    by_template: LookByTemplate[SeenThere] | None = None,
-) -> ProcedureSteps[Calibration]:
-    """Drive to each place, look, and learn from each move; the last one is predicted.
-
-    The last place is the way back: `check` must be content before it is driven, and what is seen
-    there must be what was predicted. by_template: looks once more at the last place, by the image
-    that all places together show; then all of them are taken as that image finds them.
-    """
-    before: FiducialEstimate | None = None
-    plane: ImagePlane | None = None
-    learnt, stops, seen_there = jacobian, [], []
-    for number, setpoints_um in enumerate(places):
-        last = number == len(places) - 1
-        if last:
-            check(learnt)
-        moved = yield from move(
-            MoveTo(dict(setpoints_um), f"calibration {number + 1}/{len(places)}")
-        )
-        predicted = None
-        if last and before is not None:
-            predicted = before.moved_to(moved.readback_um, learnt, gate.noise)
-        seen = yield from look(before, predicted)
-        plane = _checked_plane(plane, seen.plane)
-        here = seen.at(moved.readback_um)
-        if predicted is not None:
-            check_prediction(predicted, here, gate)
-        if before is not None:
-            learnt = learn_from_move(learnt, before, here, gate.noise)
-        before = here
-        stops.append(here)
-        seen_there.append(seen)
-    assert plane is not None
-    known = Calibration(learnt, stops[-1], plane, seen_there[-1].measurement_id)
-    if by_template is not None:
-        templates = tuple(
-            tuple(one.measurement_id for one in views)
-            for views in zip(*(seen.all_measured for seen in seen_there), strict=True)
-        )
-        answers = yield from by_template(seen_there[-1], stops[-1], templates)
-        known, stops = _as_templates_find(known, stops, answers, templates)
-        for one, other in pairwise(stops):
-            if other is stops[-1]:
-                predicted = one.moved_to(other.setpoints_um, jacobian, gate.noise)
-                check_prediction(predicted, other, gate)
-            jacobian = learn_from_move(jacobian, one, other, gate.noise)
-        known = replace(known, jacobian=jacobian, estimate=stops[-1])
-    check(known.jacobian)
-    _refuse(lambda: _check_there_and_back(known.jacobian, stops[0], stops[-1], places))
-    return known
-
-
-def _as_templates_find(
+def _by_template(
+    arguments: CalibrationArguments,
     known: Calibration,
     stops: list[FiducialEstimate],
-    answers: Sequence[Measured],
-    templates: Templates,
-) -> tuple[Calibration, list[FiducialEstimate]]:
-    """The calibration by the fiducials' own images, and where they were by them at every stop.
+    looks: Sequence[Seen],
+) -> ProcedureSteps[tuple[Calibration, list[FiducialEstimate]]]:
+    """Look once more at the last place, by the image of each fiducial that all places show.
 
-    As it was where a disc answered instead: then that is what the next looks are by, too.
+    Returns the calibration by those images, and where the fiducials were by them at every stop. As
+    it was where a disc answered instead: then that is what the next looks are by, too.
     """
+    templates = tuple(
+        tuple(one.measurement_id for one in views)
+        for views in zip(*(seen.measured for seen in looks), strict=True)
+    )
+    expected = arguments.gate.around(stops[-1])
+    answers = yield from see_again(
+        looks[-1], arguments.geometry, arguments.method, expected, templates
+    )
     for answer in answers:
         if not answer.ok:
             raise ProcedureFailedError(answer.reason_code, answer.reason)
     newest = max(answer.measurement_id for answer in answers)
     if any(answer.method != TEMPLATE for answer in answers):
         return replace(known, measurement_id=newest), stops
-    found = []
-    for number, stop in enumerate(stops):
-        views = [answer.views[number] for answer in answers]
-        found.append(
-            FiducialEstimate(
-                stop.setpoints_um,
-                np.concatenate([view.plane_mm for view in views]),
-                block_diag(*(view.covariance_mm2 for view in views)),
-            )
-        )
+    found = [
+        estimate_from([answer.views[number] for answer in answers], stop.setpoints_um)
+        for number, stop in enumerate(stops)
+    ]
     found_by = FoundBy.of(answers, templates)
-    return replace(known, measurement_id=newest, found_by=found_by), found
+    known = replace(known, measurement_id=newest, found_by=found_by, estimate=found[-1])
+    return known, found
+
+
+def _learn_again(
+    jacobian: ImageJacobian, stops: Sequence[FiducialEstimate], gate: ValidationGate
+) -> ImageJacobian:
+    """From all places as they were found at last; the way back is predicted again."""
+    for one, other in pairwise(stops):
+        if other is stops[-1]:
+            check_prediction(one.moved_to(other.setpoints_um, jacobian, gate.noise), other, gate)
+        jacobian = learn_from_move(jacobian, one, other, gate.noise)
+    return jacobian
 
 
 def _check_there_and_back(
@@ -335,15 +283,15 @@ def _check_there_and_back(
             )
 
 
-def _check(jacobian: ImageJacobian) -> None:
-    _refuse(jacobian.check)
+def _check(arguments: CalibrationArguments, jacobian: ImageJacobian) -> None:
+    _refuse(lambda: arguments.geometry.check(jacobian))
 
 
 def _refuse(check: Callable[[], None]) -> None:
     try:
         check()
     except CalibrationError as error:
-        raise ProcedureFailedError("calibration", str(error)) from error
+        raise ProcedureFailedError(error.code, str(error)) from error
 
 
 def learn_from_move(
@@ -363,48 +311,26 @@ def learn_from_move(
 
 
 def _places(arguments: CalibrationArguments) -> list[dict[str, int]]:
-    first, second = arguments.axes
-    origin = dict(arguments.origin_um)
-    along_first = {**origin, first: origin[first] + arguments.move_um}
-    along_both = {**along_first, second: origin[second] + arguments.move_um}
-    return [origin, along_first, along_both, origin]
-
-
-def _expectation(
-    before: FiducialEstimate | None,
-    predicted: FiducialEstimate | None,
-    arguments: CalibrationArguments,
-) -> Expectation | None:
-    if before is None:
-        return None
-    if predicted is not None:
-        return arguments.gate.around(predicted)
-    # which way the axis points in the image is not known yet: anywhere around the last place
-    return Expectation(before.plane_mm, abs(arguments.move_um) / 1000 * 1.3)
-
-
-def _checked_plane(plane: ImagePlane | None, this: ImagePlane) -> ImagePlane:
-    if plane is not None and not this.is_parallel_to(plane):
-        raise ProcedureFailedError(
-            "plane_changed", "the slice orientation changed during the procedure: rescan as before"
-        )
-    return plane or this
+    places = [dict(arguments.origin_um)]
+    for axis in arguments.axes:
+        places.append({**places[-1], axis: places[-1][axis] + arguments.move_um})
+    return [*places, dict(arguments.origin_um)]
 
 
 def _refine(found: Calibration, arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
     """Measure once more with the commanded shifts around the origin, if any are wanted."""
     if len(arguments.shifts_px) < 2:
         return found
-    expectation = arguments.gate.around(found.estimate)
-    shifted = yield from measure_shift_set(
+    (expected,) = arguments.gate.around(found.estimate)
+    measured, estimate = yield from measure_shift_set(
         found.estimate,
         arguments.shifts_px,
         found.jacobian,
         found.plane,
         arguments.method,
-        expectation,
+        expected,
         arguments.gate.noise,
-        found.template_of(),
+        found.found_by.template_of(0),
     )
     # all that was known before has been through the same moves: nothing to add
-    return replace(found, estimate=shifted.estimate, measurement_id=shifted.measured.measurement_id)
+    return replace(found, estimate=estimate, measurement_id=measured.measurement_id)

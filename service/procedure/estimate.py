@@ -45,6 +45,11 @@ class FiducialEstimate:
     plane_mm: Array
     covariance_mm2: Array
 
+    @property
+    def each(self) -> list[slice]:
+        """Where each fiducial's pair stands."""
+        return [slice(at, at + 2) for at in range(0, len(self.plane_mm), 2)]
+
     def moved_to(
         self, setpoints_um: Mapping[str, int], jacobian: ImageJacobian, noise: MotionNoise
     ) -> FiducialEstimate:

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, replace
-from typing import Protocol
 
 import numpy as np
 
@@ -24,6 +23,7 @@ from service.procedure.observe import (
 )
 from service.procedure.plan import Plan, PlanRefusedError, Travel, plan_move
 from service.procedure.steps import MoveTo, ProcedureSteps
+from service.procedure.strategies import Observation
 
 # so far from standing still that chance does not do it
 _SEEN_SIGMA = 6.0
@@ -36,11 +36,10 @@ def moved_visibly(before: FiducialEstimate, after: FiducialEstimate) -> bool:
     """Whether each fiducial was seen elsewhere after a move than before it, beyond chance."""
     step_mm = after.plane_mm - before.plane_mm
     covariance = before.covariance_mm2 + after.covariance_mm2
-    parts = (slice(at, at + 2) for at in range(0, len(step_mm), 2))
     return all(
         float(np.sqrt(step_mm[one] @ np.linalg.solve(covariance[one, one], step_mm[one])))
         >= _SEEN_SIGMA
-        for one in parts
+        for one in after.each
     )
 
 
@@ -87,22 +86,12 @@ class ProofArguments:
         return {axis: Travel(low, high) for axis, (low, high) in self.travel_um.items()}
 
 
-class Seen(Protocol):
-    """One look; see `steering.AnyLook`."""
-
-    @property
-    def found(self) -> FiducialEstimate: ...
-
-    @property
-    def after_loss(self) -> bool: ...
-
-
 def show_that_it_follows(
     seen: Calibration,
     arguments: ProofArguments,
     gate: ValidationGate,
     name: str,
-    look: Callable[[Calibration], ProcedureSteps[Seen]],
+    look: Callable[[Calibration], ProcedureSteps[Observation]],
 ) -> ProcedureSteps[FiducialEstimate]:
     """Move by part of a pixel, look, and move back; return the estimate at the place before.
 
@@ -130,7 +119,7 @@ def show_that_it_follows(
         check_prediction(predicted, there.found, gate)
     except ProcedureFailedError as error:
         raise ProcedureFailedError("identity", f"{text}: {error}") from error
-    if there.after_loss or not moved_visibly(seen.estimate, there.found):
+    if there.seen.after_loss or not moved_visibly(seen.estimate, there.found):
         raise ProcedureFailedError("identity", text)
     back = yield from move(MoveTo(dict(plan.from_um), f"back from the {PROOF}"))
     return there.found.moved_to(back.readback_um, seen.jacobian, gate.noise)

@@ -30,6 +30,10 @@ _CHANGE_SIGMAS = 5.0
 class CalibrationError(Exception):
     """The moves of a calibration do not give an image Jacobian that could be right."""
 
+    def __init__(self, text: str, code: str = "calibration") -> None:
+        super().__init__(text)
+        self.code = code
+
 
 @dataclass(frozen=True, eq=False)
 class ImageJacobian:

@@ -1,4 +1,4 @@
-"""The parts of a procedure that look: slices at one place, or at a set of commanded shifts."""
+"""The parts of a procedure that move, ask and look: what it does, and which answers it believes."""
 
 from __future__ import annotations
 
@@ -8,11 +8,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.linalg import block_diag
 from scipy.special import chdtri
 
 from dicom_slice.reasons import Reason
-from service.procedure.estimate import FiducialEstimate, MotionNoise, motion_covariance
-from service.procedure.jacobian import ImageJacobian
+from service.procedure.estimate import FiducialEstimate, MotionNoise
+from service.procedure.fiducials import (
+    Geometry,
+    GuideSeenWrongError,
+    NeedleSeen,
+    needle_seen,
+)
 from service.procedure.plan import Plan
 from service.procedure.plane import ImagePlane
 from service.procedure.steps import (
@@ -26,10 +32,12 @@ from service.procedure.steps import (
     Moved,
     MoveTo,
     ProcedureSteps,
+    SeenBefore,
     ask,
 )
 
 Array = NDArray[np.float64]
+Templates = tuple[tuple[int, ...], ...]
 _TRIES = 3
 # the slices could not be used: that says nothing of the fiducial
 _NOT_EVEN_LOOKED = frozenset({"no_slices", "geometry_changed", "disturbed", *map(str, Reason)})
@@ -73,10 +81,16 @@ class ValidationGate:
     def noise(self) -> MotionNoise:
         return MotionNoise(self.repeatability_mm, self.scale_error)
 
-    def around(self, predicted: FiducialEstimate) -> Expectation:
-        """Where the fiducial is looked for."""
-        worst = float(np.sqrt(np.linalg.eigvalsh(predicted.covariance_mm2)[-1]))
-        return Expectation(predicted.plane_mm, max(self.position_gate_mm, self.gate_sigma * worst))
+    def around(self, predicted: FiducialEstimate) -> tuple[Expectation, ...]:
+        """Where each fiducial is looked for."""
+        return tuple(
+            self._around(predicted.plane_mm[one], predicted.covariance_mm2[one, one])
+            for one in predicted.each
+        )
+
+    def _around(self, plane_mm: Array, covariance_mm2: Array) -> Expectation:
+        worst = float(np.sqrt(np.linalg.eigvalsh(covariance_mm2)[-1]))
+        return Expectation(plane_mm, max(self.position_gate_mm, self.gate_sigma * worst))
 
 
 def move(step: MoveTo) -> ProcedureSteps[Moved]:
@@ -105,30 +119,143 @@ def ask_to_confirm(name: str, plan: Plan) -> ProcedureSteps[None]:
         raise ProcedureFailedError("rejected", f"the move was rejected by {answer.who}")
 
 
-def measure_here(
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """Every fiducial as one look found it, each in a slice of its own.
+
+    acquired: the holds at which more slices could be taken; none after a shift set.
+    """
+
+    measured: tuple[Measured, ...]
+    acquired: tuple[Acquired, ...] = ()
+
+    @property
+    def frames(self) -> int:
+        """Slices of all together."""
+        return sum(one.frames for one in self.measured)
+
+    @property
+    def frames_of_each(self) -> int:
+        return self.measured[0].frames
+
+    @property
+    def scan_s(self) -> float:
+        return sum(one.scan_s for one in self.measured)
+
+    @property
+    def measurement_id(self) -> int:
+        return max(one.measurement_id for one in self.measured)
+
+    @property
+    def after_loss(self) -> bool:
+        """At first one of them was not found."""
+        return any(one.after_loss for one in self.measured)
+
+    @property
+    def plane(self) -> ImagePlane:
+        return ImagePlane.from_json(self.measured[0].plane)
+
+    def at(self, setpoints_um: Mapping[str, int]) -> FiducialEstimate:
+        """What it says by itself; the slices have nothing in common."""
+        return estimate_from(self.measured, setpoints_um)
+
+
+def see(
+    geometry: Geometry,
     method: str,
-    expectation: Expectation | None,
+    expected: Sequence[Expectation | None],
+    templates: Templates = (),
     *,
     fresh: bool = False,
-    slice_position_mm: float | None = None,
-    template: Sequence[int] = (),
     any_shape: bool = False,
-) -> ProcedureSteps[tuple[Acquired, Measured]]:
-    """Localize the fiducial in one slice taken where the robot stands; if it fails, scan again.
+) -> ProcedureSteps[Seen]:
+    """Localize every fiducial in one slice taken where the robot stands; if it fails, scan again.
 
     fresh: the robot has not moved since the last measurement, which must not count twice.
-    template: the measurements that show the fiducial's image, by which the maximum-likelihood fit
-    then goes. any_shape: see `Measure`.
+    templates: of each fiducial the measurements that show its image, by which the
+    maximum-likelihood fit then goes. any_shape: see `Measure`.
     """
+    acquired: list[Acquired] = []
+    measured = []
+    for look in _looks(geometry, method, expected, templates, any_shape=any_shape):
+        hold, one = yield from _measure_here(look, fresh=fresh and not acquired)
+        acquired.append(hold)
+        measured.append(one)
+    seen = Seen(tuple(measured), tuple(acquired))
+    if not all(ImagePlane.from_json(one.plane).is_parallel_to(seen.plane) for one in measured):
+        raise ProcedureFailedError(
+            "plane_changed", f"the slices of the {len(measured)} fiducials are not parallel"
+        )
+    return seen
+
+
+def see_longer(
+    seen: Seen,
+    geometry: Geometry,
+    method: str,
+    expected: Sequence[Expectation | None],
+    templates: Templates = (),
+    *,
+    frames: int,
+) -> ProcedureSteps[Seen]:
+    """Localize again with `frames` slices of each fiducial in all from the same holds."""
+    acquired, measured = [], []
+    looks = _looks(geometry, method, expected, templates)
+    for hold, look in zip(seen.acquired, looks, strict=True):
+        more = yield from ask(Acquire(frames, slice_position_mm=look.slice_position_mm), Acquired)
+        acquired.append(more)
+        measured.append((yield from measured_or_failed(_of_holds(look, hold, more))))
+    return Seen(tuple(measured), tuple(acquired))
+
+
+def see_again(
+    seen: Seen,
+    geometry: Geometry,
+    method: str,
+    expected: Sequence[Expectation | None],
+    templates: Templates,
+) -> ProcedureSteps[tuple[Measured, ...]]:
+    """Localize anew from the slices that were seen; what was not found is among the answers."""
+    measured = []
+    looks = _looks(geometry, method, expected, templates)
+    for hold, look in zip(seen.acquired, looks, strict=True):
+        measured.append((yield from ask(_of_holds(look, hold), Measured)))
+    return tuple(measured)
+
+
+def _looks(
+    geometry: Geometry,
+    method: str,
+    expected: Sequence[Expectation | None],
+    templates: Templates,
+    *,
+    any_shape: bool = False,
+) -> list[Measure]:
+    """How each fiducial is measured, still without holds."""
+    each = zip(
+        geometry.slice_positions_mm,
+        expected,
+        templates or ((),) * len(expected),
+        strict=True,
+    )
+    return [
+        measure_step((), method, at, slice_position_mm=mm, template=template, any_shape=any_shape)
+        for mm, at, template in each
+    ]
+
+
+def _of_holds(look: Measure, *holds: Acquired) -> Measure:
+    hold_ids = dict.fromkeys(hold.hold_id for hold in holds)
+    return replace(look, holds=tuple(HoldShift(hold_id, (0.0, 0.0)) for hold_id in hold_ids))
+
+
+def _measure_here(look: Measure, *, fresh: bool) -> ProcedureSteps[tuple[Acquired, Measured]]:
     lost = False
     for attempt in range(_TRIES):
         # a new hold: the slices that could not be used stay out of the next try
-        acquired = yield from ask(Acquire(1, fresh or attempt > 0, slice_position_mm), Acquired)
-        holds = (HoldShift(acquired.hold_id, (0.0, 0.0)),)
-        step = measure_step(
-            holds, method, expectation, slice_position_mm=slice_position_mm, template=template
-        )
-        measured = yield from ask(replace(step, any_shape=any_shape), Measured)
+        step = Acquire(1, fresh or attempt > 0, look.slice_position_mm)
+        acquired = yield from ask(step, Acquired)
+        measured = yield from ask(_of_holds(look, acquired), Measured)
         if measured.ok:
             return acquired, replace(measured, after_loss=lost)
         lost = lost or measured.reason_code not in _NOT_EVEN_LOOKED
@@ -145,127 +272,33 @@ def _ask_to_rescan(measured: Measured) -> ProcedureSteps[None]:
         )
 
 
-def measure_again(
-    acquired: Acquired,
-    method: str,
-    expectation: Expectation | None,
-    *,
-    frames: int,
-    slice_position_mm: float | None = None,
-    template: Sequence[int] = (),
-) -> ProcedureSteps[tuple[Acquired, Measured]]:
-    """Take more slices at the same hold and localize from all of them."""
-    more = yield from ask(Acquire(frames, slice_position_mm=slice_position_mm), Acquired)
-    hold_ids = dict.fromkeys((acquired.hold_id, more.hold_id))
-    holds = tuple(HoldShift(hold_id, (0.0, 0.0)) for hold_id in hold_ids)
-    step = measure_step(
-        holds, method, expectation, slice_position_mm=slice_position_mm, template=template
-    )
+def measured_or_failed(step: Measure) -> ProcedureSteps[Measured]:
+    """Measure; raises ProcedureFailedError where that finds nothing."""
     measured = yield from ask(step, Measured)
     if not measured.ok:
         raise ProcedureFailedError(measured.reason_code, measured.reason)
-    return more, measured
+    return measured
 
 
-@dataclass(frozen=True, eq=False)
-class ShiftSetResult:
-    """A measurement at commanded shifts, and where the fiducial is after the way back."""
-
-    measured: Measured
-    estimate: FiducialEstimate
-
-
-def measure_shift_set(
-    reference: FiducialEstimate,
-    shifts_px: Sequence[tuple[float, float]],
-    jacobian: ImageJacobian,
-    plane: ImagePlane,
-    method: str,
-    expectation: Expectation | None,
-    noise: MotionNoise,
-    template: Sequence[int] = (),
-) -> ProcedureSteps[ShiftSetResult]:
-    """Take one slice at each commanded shift around the reference setpoints; localize from all.
-
-    The robot is brought back to the reference at the end, as in the paper. Without encoders the
-    errors of the moves in between add up, and the estimate's covariance says so.
-    """
-    holds: list[HoldShift] = []
-    readbacks = [dict(reference.setpoints_um)]
-    for place, shift_px in enumerate(shifts_px):
-        setpoints_um = _shifted(reference, shift_px, jacobian, plane)
-        moved = yield from move(
-            MoveTo(
-                setpoints_um,
-                "commanded shift",
-                new_set=place == 0,
-                place=place,
-                shift_px=shift_px,
-                shift_um=_difference(setpoints_um, reference.setpoints_um),
-            )
-        )
-        acquired = yield from ask(Acquire(1), Acquired)
-        shift_mm, _ = jacobian.displacement(_change_mm(moved.readback_um, reference.setpoints_um))
-        holds.append(HoldShift(acquired.hold_id, (float(shift_mm[0]), float(shift_mm[1]))))
-        readbacks.append(dict(moved.readback_um))
-    moved = yield from move(MoveTo(dict(reference.setpoints_um), "back to the reference"))
-    readbacks.append(dict(moved.readback_um))
-    sigma_mm = shift_sigma_mm(noise, len(holds))
-    step = measure_step(tuple(holds), method, expectation, sigma_mm, template=template)
-    measured = yield from ask(step, Measured)
-    if not measured.ok:
-        raise ProcedureFailedError(measured.reason_code, measured.reason)
-    after = estimate_from(measured, moved.readback_um)
-    spread = _way_back_covariance(readbacks, jacobian, noise)
-    if method == ML:  # its covariance has the same errors in it, as if they were independent
-        spread = spread - np.eye(2) * sigma_mm**2 / len(holds)
-    return ShiftSetResult(measured, replace(after, covariance_mm2=after.covariance_mm2 + spread))
-
-
-def shift_sigma_mm(noise: MotionNoise, count: int) -> float:
-    """How far a hold of a shift set may be from its shift (standard deviation, one axis).
-
-    The errors of the moves add up, so the holds are a random walk; this is the largest standard
-    deviation that any combination of `count` centred holds has.
-    """
-    if count < 2:
-        return 0.0
-    return noise.repeatability_mm / (2.0 * math.sin(math.pi / (2 * count)))
-
-
-def _way_back_covariance(
-    readbacks_um: Sequence[Mapping[str, int]], jacobian: ImageJacobian, noise: MotionNoise
-) -> Array:
-    """Covariance (2, 2) mm² of the last place minus the mean of the holds, which it refers to.
-
-    Move j (of 0 to N) of the way has moved j of the N holds not yet, so its error counts j/N.
-    """
-    count = len(readbacks_um) - 2
-    total = np.zeros((2, 2))
-    for number in range(1, count + 1):
-        change_mm = _change_mm(readbacks_um[number + 1], readbacks_um[number])
-        total += (number / count) ** 2 * motion_covariance(change_mm, jacobian, noise)
-    return total
-
-
-def _shifted(
-    reference: FiducialEstimate,
-    shift_px: tuple[float, float],
-    jacobian: ImageJacobian,
-    plane: ImagePlane,
-) -> dict[str, int]:
-    wanted_mm = np.array(shift_px) * np.array(plane.spacing_mm)
-    setpoints_um = dict(reference.setpoints_um)
-    for axis, change_mm in jacobian.setpoint_change_mm(wanted_mm).items():
-        setpoints_um[axis] += round(change_mm * 1000.0)
-    return setpoints_um
-
-
-def estimate_from(measured: Measured, setpoints_um: Mapping[str, int]) -> FiducialEstimate:
-    """What a measurement says by itself."""
+def estimate_from(
+    measured: Sequence[Measured | SeenBefore], setpoints_um: Mapping[str, int]
+) -> FiducialEstimate:
+    """What measurements of each fiducial say by themselves."""
     return FiducialEstimate(
-        dict(setpoints_um), np.array(measured.plane_mm), np.array(measured.covariance_mm2)
+        dict(setpoints_um),
+        np.concatenate([one.plane_mm for one in measured]),
+        block_diag(*(one.covariance_mm2 for one in measured)),
     )
+
+
+def see_needle(
+    geometry: Geometry, estimate: FiducialEstimate, plane: ImagePlane, lower_plane_mm: float
+) -> NeedleSeen | None:
+    """Where the needle goes by the guide as it is seen; ProcedureFailedError if that cannot be."""
+    try:
+        return needle_seen(geometry, estimate, plane, lower_plane_mm)
+    except GuideSeenWrongError as wrong:
+        raise ProcedureFailedError("guide", str(wrong)) from wrong
 
 
 def check_prediction(
@@ -294,9 +327,11 @@ def measure_step(
     holds: tuple[HoldShift, ...],
     method: str,
     expectation: Expectation | None,
+    *,
     shift_sigma_mm: float = 0.0,
     slice_position_mm: float | None = None,
     template: Sequence[int] = (),
+    any_shape: bool = False,
 ) -> Measure:
     """The maximum-likelihood fit is that of the template where there is one; see `Measure`."""
     if method != ML:
@@ -307,16 +342,9 @@ def measure_step(
         shift_sigma_mm=shift_sigma_mm,
         slice_position_mm=slice_position_mm,
         template=tuple(template),
+        any_shape=any_shape,
     )
     if expectation is None:
         return step
     row, col = expectation.plane_mm.tolist()
     return replace(step, expected_plane_mm=(row, col), gate_mm=expectation.gate_mm)
-
-
-def _difference(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, int]:
-    return {axis: a[axis] - b[axis] for axis in b if axis in a}
-
-
-def _change_mm(a: Mapping[str, int], b: Mapping[str, int]) -> dict[str, float]:
-    return {axis: change / 1000.0 for axis, change in _difference(a, b).items()}

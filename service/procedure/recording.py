@@ -1,4 +1,7 @@
-"""Recording a target: where the fiducial is now, looked at as an approach would at its end."""
+"""Recording a target: where the fiducial is now, or where the guide points.
+
+It is looked at as an approach would at its end.
+"""
 
 from __future__ import annotations
 
@@ -10,92 +13,116 @@ import numpy as np
 
 from service.procedure.calibration import Calibration
 from service.procedure.estimate import FiducialEstimate, axis_sigma
+from service.procedure.fiducials import ONE_FIDUCIAL, Geometry, NeedleSeen, judged_point
 from service.procedure.identity import ProofArguments, show_that_it_follows
-from service.procedure.observe import ValidationGate, check_prediction
+from service.procedure.observe import ValidationGate, check_prediction, see_needle
 from service.procedure.steps import ProcedureSteps
-from service.procedure.strategies import STRATEGIES, Observation, look_at_fiducial, look_longer
+from service.procedure.strategies import STRATEGIES, Observation, look, look_longer
 
 _MOST_FRAMES = 8
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class RecordingArguments:
-    """sigma_mm: how well the place is to be known (worst axis), as far as slices can do that.
+    """sigma_mm: how well the place is to be known (worst axis), as far as slices can do that; of
+    the guide the needle's tip.
 
-    proof: what a move needs that shows whether what is seen is the fiducial.
+    proof: what a move needs that shows whether what is seen is the fiducial. lower_plane_mm: of the
+    guide's lower ball joints along the slice normal.
     """
 
-    strategy: str
     sigma_mm: float
     gate: ValidationGate
+    strategy: str = "adaptive"
     seed: int = 0
     proof: ProofArguments = field(default_factory=ProofArguments)
+    geometry: Geometry = ONE_FIDUCIAL
+    lower_plane_mm: float = 0.0
 
 
 @dataclass(frozen=True, eq=False)
 class Place:
-    """Where the fiducial is: what is known now, and what finding it out took."""
+    """Where the fiducials are: what is known now, and what finding it out took.
+
+    sigma_mm: of the fiducial, or of the needle's tip; needle: with four axes, where it goes.
+    """
 
     calibration: Calibration
+    sigma_mm: float
     frames: int
     scan_s: float
+    needle: NeedleSeen | None = None
 
-    def patient_mm(self, found: Mapping[str, Any]) -> list[float]:
+    def target_mm(self, found: Mapping[str, Any]) -> list[float]:
         """Patient mm (LPS, 3) of the place; `found` is what the worker wrote of its measurement.
 
-        Along the slice normal it is where the slice lies.
+        Of one fiducial it is, along the slice normal, where the slice lies.
         """
+        if self.needle is not None:
+            return list(self.needle.tip_mm)
         better_mm = self.calibration.estimate.plane_mm - np.array(found["plane_mm"])
         step_mm = self.calibration.plane.direction(better_mm)
         return [float(value) for value in np.array(found["patient_mm"]) + step_mm]
 
     def to_json(self) -> dict[str, Any]:
-        estimate = self.calibration.estimate
         return {
             "calibration": self.calibration.to_json(),
             "measurement_id": self.calibration.measurement_id,
-            "sigma_mm": axis_sigma(estimate.covariance_mm2),
+            "sigma_mm": self.sigma_mm,
             "frames": self.frames,
             "scan_s": self.scan_s,
+            **({} if self.needle is None else self.needle.to_json()),
         }
 
 
 def record_place(arguments: RecordingArguments, start: Calibration) -> ProcedureSteps[Place]:
-    """Return `start` with the estimate of where the fiducial is, the robot standing still.
+    """Return `start` with the estimate of where the fiducials are, the robot standing still.
 
     A strategy that fuses takes as many slices as the bound asks for; the paper's take one look.
     """
     strategy = STRATEGIES[arguments.strategy]
-    gate, seed = arguments.gate, (arguments.seed, 0)
-    look = yield from look_at_fiducial(strategy.fine, start, gate, seed=seed, fresh=True)
-    check_prediction(start.estimate, look.found, gate)
-    if not arguments.proof.proven or look.after_loss:
-        seen = replace(start, estimate=look.found, measurement_id=look.measurement_id)
+    geometry, gate, seed = arguments.geometry, arguments.gate, (arguments.seed, 0)
+    here = yield from look(geometry, strategy.fine, start, gate, seed=seed, fresh=True)
+    check_prediction(start.estimate, here.found, gate)
+    if not arguments.proof.proven or here.seen.after_loss:
+        seen = replace(start, estimate=here.found, measurement_id=here.seen.measurement_id)
         away = yield from show_that_it_follows(
             seen,
             arguments.proof,
             gate,
-            "fiducial",
-            lambda there: look_at_fiducial(strategy.fine, there, gate, seed=seed, fresh=False),
+            geometry.name,
+            lambda there: look(geometry, strategy.fine, there, gate, seed=seed, fresh=False),
         )
         start = replace(start, estimate=away)
-        look = yield from look_at_fiducial(strategy.fine, start, gate, seed=seed, fresh=False)
-        check_prediction(start.estimate, look.found, gate)
-    if not strategy.fuses or look.acquired is None:
-        return _place(start, look.found, look)
-    wanted = slices_for(look.found, look.frames, arguments.sigma_mm)
-    if wanted > look.frames:
-        look = yield from look_longer(look, look.acquired, gate, frames=wanted)
-    estimate = look.prior.fused_with(look.found.plane_mm, look.found.covariance_mm2)
-    return _place(start, estimate, look)
+        here = yield from look(geometry, strategy.fine, start, gate, seed=seed, fresh=False)
+        check_prediction(start.estimate, here.found, gate)
+    estimate = here.found
+    if strategy.fuses and here.can_go_on:
+        wanted = _slices_for(arguments, here)
+        if wanted > here.seen.frames_of_each:
+            here = yield from look_longer(here, geometry, gate, frames=wanted)
+        estimate = here.prior.fused_with(here.found.plane_mm, here.found.covariance_mm2)
+    return _place(arguments, start, estimate, here)
 
 
-def _place(start: Calibration, estimate: FiducialEstimate, look: Observation) -> Place:
-    calibration = replace(start, estimate=estimate, measurement_id=look.measurement_id)
-    return Place(calibration, look.frames, look.scan_s)
+def _place(
+    arguments: RecordingArguments,
+    start: Calibration,
+    estimate: FiducialEstimate,
+    here: Observation,
+) -> Place:
+    geometry = arguments.geometry
+    return Place(
+        replace(start, estimate=estimate, measurement_id=here.seen.measurement_id),
+        axis_sigma(judged_point(geometry, estimate)[1]),
+        here.seen.frames,
+        here.seen.scan_s,
+        see_needle(geometry, estimate, start.plane, arguments.lower_plane_mm),
+    )
 
 
-def slices_for(found: FiducialEstimate, frames: int, sigma_mm: float) -> int:
-    """How many slices bring the worst axis to `sigma_mm` by the bound, and never too many."""
-    worst = float(np.linalg.eigvalsh(found.covariance_mm2)[-1])
-    return min(_MOST_FRAMES, max(frames, int(np.ceil(frames * worst / sigma_mm**2))))
+def _slices_for(arguments: RecordingArguments, here: Observation) -> int:
+    """Slices of each fiducial that make the place as well known by the bound, never too many."""
+    frames = here.seen.frames_of_each
+    worst = float(np.linalg.eigvalsh(judged_point(arguments.geometry, here.found)[1])[-1])
+    return min(_MOST_FRAMES, max(frames, int(np.ceil(frames * worst / arguments.sigma_mm**2))))

@@ -8,35 +8,28 @@ from typing import Any
 
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Procedure
-from service.procedure.approach import ApproachArguments, Arrival, approach
+from robot_bridge.protocol.phases import WorkPhase
+from service.procedure.aim import ApproachArguments
+from service.procedure.approach import Arrival, approach
 from service.procedure.calibration import Calibration, CalibrationArguments, calibrate
-from service.procedure.guide_approach import GuideApproachArguments, GuideArrival, approach_guide
-from service.procedure.guide_calibration import GuideCalibrationArguments, calibrate_guide
-from service.procedure.guide_geometry import GuideGeometry
-from service.procedure.guide_recording import GuidePlace, GuideRecordingArguments, record_guide
+from service.procedure.fiducials import geometry_from_json
 from service.procedure.identity import ProofArguments
 from service.procedure.observe import ValidationGate, move
 from service.procedure.recording import Place, RecordingArguments, record_place
 from service.procedure.scan_frame import calibration_good_since, frame_of, other_place_since
 from service.procedure.steps import MoveTo, ProcedureSteps
 
+# by these names in the record and the API; guide: the same procedure with two fiducials, four axes
 CALIBRATION = "calibration"
 APPROACH = "approach"
 RECORDING = "recording"
 GUIDE_CALIBRATION = "guide_calibration"
 GUIDE_APPROACH = "guide_approach"
 GUIDE_RECORDING = "guide_recording"
-JOG, JOG_PURPOSE = "jog", "manual"
+JOG = "jog"
 CALIBRATIONS, APPROACHES = (CALIBRATION, GUIDE_CALIBRATION), (APPROACH, GUIDE_APPROACH)
 
-Arguments = (
-    CalibrationArguments
-    | ApproachArguments
-    | RecordingArguments
-    | GuideCalibrationArguments
-    | GuideApproachArguments
-    | GuideRecordingArguments
-)
+Arguments = CalibrationArguments | ApproachArguments | RecordingArguments
 
 
 @dataclass(frozen=True)
@@ -51,7 +44,7 @@ class JogEnd:
 
 def jog(setpoints_um: Mapping[str, int]) -> ProcedureSteps[JogEnd]:
     """Go to the setpoints; raises ProcedureFailedError if the bridge refuses."""
-    moved = yield from move(MoveTo(dict(setpoints_um), JOG_PURPOSE))
+    moved = yield from move(MoveTo(dict(setpoints_um), "manual", phase=WorkPhase.MANUAL))
     return JogEnd(moved.readback_um)
 
 
@@ -68,19 +61,7 @@ def approach_arguments(arguments: ApproachArguments, start: Calibration) -> dict
     return {"arguments": _recorded(arguments), "start": start.to_json()}
 
 
-def recording_arguments(
-    arguments: RecordingArguments | GuideRecordingArguments, start: Calibration
-) -> dict[str, Any]:
-    return {"arguments": _recorded(arguments), "start": start.to_json()}
-
-
-def guide_calibration_arguments(arguments: GuideCalibrationArguments) -> dict[str, Any]:
-    return _recorded(arguments)
-
-
-def guide_approach_arguments(
-    arguments: GuideApproachArguments, start: Calibration
-) -> dict[str, Any]:
+def recording_arguments(arguments: RecordingArguments, start: Calibration) -> dict[str, Any]:
     return {"arguments": _recorded(arguments), "start": start.to_json()}
 
 
@@ -91,18 +72,25 @@ def _recorded(arguments: Arguments) -> dict[str, Any]:
     return {**values, **gate}
 
 
-def _with_gate(recorded: Mapping[str, Any]) -> dict[str, Any]:
-    """The arguments again, from what `_recorded` made of them."""
+def _told(recorded: Mapping[str, Any]) -> dict[str, Any]:
+    """The arguments again, from what `_recorded` made of them, in a program before as well."""
     values = dict(recorded)
     gate = ValidationGate(
         **{field.name: values.pop(field.name) for field in fields(ValidationGate)}
     )
-    return {**values, "gate": gate}
+    if "proof" in values:
+        values["proof"] = ProofArguments(**values["proof"])
+    if "travel_um" in values:
+        values["travel_um"] = {
+            axis: (low, high) for axis, (low, high) in values["travel_um"].items()
+        }
+    for name in ("axes", "target_mm", "systematic_mm"):
+        if name in values:
+            values[name] = tuple(values[name])
+    return {**values, "gate": gate, "geometry": geometry_from_json(values.get("geometry"))}
 
 
-def result_to_json(
-    result: Calibration | Arrival | GuideArrival | Place | GuidePlace | JogEnd,
-) -> dict[str, Any]:
+def result_to_json(result: Calibration | Arrival | Place | JogEnd) -> dict[str, Any]:
     return result.to_json()
 
 
@@ -142,72 +130,28 @@ def _is_of_another_place(record: CaseRecord, calibration: Calibration) -> bool:
     return bool(other_place_since(record, measurement.requested_seq, here))
 
 
-def _with_proof(known: dict[str, Any]) -> dict[str, Any]:
-    """The arguments of a proof move again; a program before did not know of any."""
-    proof = known.get("proof")
-    return known if proof is None else {**known, "proof": ProofArguments(**proof)}
-
-
 def _build_calibration(value: Mapping[str, Any]) -> ProcedureSteps[Calibration]:
-    first, second = value["axes"]
-    shifts_px = tuple((row, col) for row, col in value["shifts_px"])
-    return calibrate(
-        CalibrationArguments(
-            **{**_with_gate(value), "axes": (first, second), "shifts_px": shifts_px}
-        )
-    )
+    known = _told(value)
+    shifts_px = tuple((row, col) for row, col in known.get("shifts_px", ()))
+    return calibrate(CalibrationArguments(**{**known, "shifts_px": shifts_px}))
 
 
 def _build_approach(value: Mapping[str, Any]) -> ProcedureSteps[Arrival]:
-    known = _with_gate(value["arguments"])
-    row, col = known["target_mm"]
-    travel_um = {axis: (low, high) for axis, (low, high) in known["travel_um"].items()}
-    arguments = ApproachArguments(**{**known, "target_mm": (row, col), "travel_um": travel_um})
+    arguments = ApproachArguments(**_told(value["arguments"]))
     return approach(arguments, Calibration.from_json(value["start"]))
 
 
 def _build_recording(value: Mapping[str, Any]) -> ProcedureSteps[Place]:
-    arguments = RecordingArguments(**_with_proof(_with_gate(value["arguments"])))
+    arguments = RecordingArguments(**_told(value["arguments"]))
     return record_place(arguments, Calibration.from_json(value["start"]))
-
-
-def _guide_geometry(value: Mapping[str, Any]) -> GuideGeometry:
-    upper_mm, lower_mm = value["slice_positions_mm"]
-    return GuideGeometry(**{**value, "slice_positions_mm": (upper_mm, lower_mm)})
-
-
-def _build_guide_calibration(value: Mapping[str, Any]) -> ProcedureSteps[Calibration]:
-    xt, yt, xb, yb = value["axes"]
-    geometry = _guide_geometry(value["geometry"])
-    return calibrate_guide(
-        GuideCalibrationArguments(
-            **{**_with_gate(value), "axes": (xt, yt, xb, yb), "geometry": geometry}
-        )
-    )
-
-
-def _build_guide_approach(value: Mapping[str, Any]) -> ProcedureSteps[GuideArrival]:
-    known = _with_gate(value["arguments"])
-    known["geometry"] = _guide_geometry(known["geometry"])
-    known["target_mm"] = tuple(known["target_mm"])
-    known["travel_um"] = {axis: (low, high) for axis, (low, high) in known["travel_um"].items()}
-    return approach_guide(GuideApproachArguments(**known), Calibration.from_json(value["start"]))
-
-
-def _build_guide_recording(value: Mapping[str, Any]) -> ProcedureSteps[GuidePlace]:
-    known = _with_gate(value["arguments"])
-    known["geometry"] = _guide_geometry(known["geometry"])
-    return record_guide(
-        GuideRecordingArguments(**_with_proof(known)), Calibration.from_json(value["start"])
-    )
 
 
 _BUILDERS: dict[str, Callable[[Mapping[str, Any]], ProcedureSteps[Any]]] = {
     CALIBRATION: _build_calibration,
     APPROACH: _build_approach,
     RECORDING: _build_recording,
-    GUIDE_CALIBRATION: _build_guide_calibration,
-    GUIDE_APPROACH: _build_guide_approach,
-    GUIDE_RECORDING: _build_guide_recording,
+    GUIDE_CALIBRATION: _build_calibration,
+    GUIDE_APPROACH: _build_approach,
+    GUIDE_RECORDING: _build_recording,
     JOG: lambda value: jog(value["setpoints_um"]),
 }

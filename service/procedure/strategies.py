@@ -1,4 +1,4 @@
-"""Strategies: how an approach looks at the fiducial, coarsely at first and finely at the end."""
+"""Strategies: how an approach looks at the fiducials, coarsely at first and finely at the end."""
 
 from __future__ import annotations
 
@@ -8,18 +8,12 @@ from types import MappingProxyType
 
 import numpy as np
 
-from service.procedure.calibration import Calibration
+from service.procedure.calibration import Calibration, FoundBy
 from service.procedure.estimate import FiducialEstimate
-from service.procedure.observe import (
-    ProcedureFailedError,
-    ValidationGate,
-    estimate_from,
-    measure_again,
-    measure_here,
-    measure_shift_set,
-)
-from service.procedure.plane import ImagePlane
-from service.procedure.steps import Acquired, Measured, ProcedureSteps
+from service.procedure.fiducials import Geometry
+from service.procedure.observe import ProcedureFailedError, Seen, ValidationGate, see, see_longer
+from service.procedure.shift_set import measure_shift_set
+from service.procedure.steps import ProcedureSteps
 from sr_engine.reconstruction.shiftset import paper_random
 
 
@@ -59,35 +53,23 @@ STRATEGIES: Mapping[str, Strategy] = MappingProxyType(
 class Observation:
     """What was seen from where the robot stands now.
 
-    found: from this look alone; prior: what was believed before it; acquired: the hold at which
-    more slices could be taken, None after a shift set.
+    found: from this look alone; prior: what was believed before it.
     """
 
-    measured: Measured
+    seen: Seen
     found: FiducialEstimate
     prior: FiducialEstimate
     method: str
-    acquired: Acquired | None
-    template: tuple[int, ...] = ()
+    found_by: FoundBy
 
     @property
-    def measurement_id(self) -> int:
-        return self.measured.measurement_id
-
-    @property
-    def frames(self) -> int:
-        return self.measured.frames
-
-    @property
-    def after_loss(self) -> bool:
-        return self.measured.after_loss
-
-    @property
-    def scan_s(self) -> float:
-        return self.measured.scan_s
+    def can_go_on(self) -> bool:
+        """More slices could be taken here: not after a shift set."""
+        return bool(self.seen.acquired)
 
 
-def look_at_fiducial(
+def look(
+    geometry: Geometry,
     way: Imaging,
     calibration: Calibration,
     gate: ValidationGate,
@@ -95,46 +77,38 @@ def look_at_fiducial(
     seed: tuple[int, int],
     fresh: bool,
 ) -> ProcedureSteps[Observation]:
-    """Observation in one of the ways; seed: of the shift set, with each look another one."""
-    prior = calibration.estimate
-    expectation = gate.around(prior)
-    if not way.shifted:
-        template = calibration.template_of()
-        acquired, measured = yield from measure_here(
-            way.method, expectation, fresh=fresh, template=template
+    """Look at every fiducial in one of the ways; seed: of the shift set, with each look another."""
+    prior, found_by = calibration.estimate, calibration.found_by
+    expected = gate.around(prior)
+    if way.shifted:
+        (one,) = expected  # a shift set is of one fiducial
+        measured, found = yield from measure_shift_set(
+            prior,
+            paper_random(np.random.default_rng(seed)).shifts_px,
+            calibration.jacobian,
+            calibration.plane,
+            way.method,
+            one,
+            gate.noise,
+            found_by.template_of(0),
         )
-        _check_plane(measured, calibration.plane)
-        found = estimate_from(measured, prior.setpoints_um)
-        return Observation(measured, found, prior, way.method, acquired, template)
-    shifts_px = paper_random(np.random.default_rng(seed)).shifts_px
-    result = yield from measure_shift_set(
-        prior,
-        shifts_px,
-        calibration.jacobian,
-        calibration.plane,
-        way.method,
-        expectation,
-        gate.noise,
-        calibration.template_of(),
-    )
-    _check_plane(result.measured, calibration.plane)
-    return Observation(result.measured, result.estimate, prior, way.method, None)
-
-
-def look_longer(
-    seen: Observation, acquired: Acquired, gate: ValidationGate, *, frames: int
-) -> ProcedureSteps[Observation]:
-    """Observation again with `frames` slices in all from the same hold."""
-    expectation = gate.around(seen.prior)
-    more, measured = yield from measure_again(
-        acquired, seen.method, expectation, frames=frames, template=seen.template
-    )
-    found = estimate_from(measured, seen.prior.setpoints_um)
-    return replace(seen, measured=measured, found=found, acquired=more)
-
-
-def _check_plane(measured: Measured, plane: ImagePlane) -> None:
-    if not ImagePlane.from_json(measured.plane).is_parallel_to(plane):
+        seen = Seen((measured,))
+    else:
+        seen = yield from see(geometry, way.method, expected, found_by.templates, fresh=fresh)
+        found = seen.at(prior.setpoints_um)
+    if not seen.plane.is_parallel_to(calibration.plane):
         raise ProcedureFailedError(
             "plane_changed", "the slice orientation differs from the calibration's"
         )
+    return Observation(seen, found, prior, way.method, found_by)
+
+
+def look_longer(
+    before: Observation, geometry: Geometry, gate: ValidationGate, *, frames: int
+) -> ProcedureSteps[Observation]:
+    """Look again with `frames` slices of each fiducial in all from the same holds."""
+    expected, templates = gate.around(before.prior), before.found_by.templates
+    seen = yield from see_longer(
+        before.seen, geometry, before.method, expected, templates, frames=frames
+    )
+    return replace(before, seen=seen, found=seen.at(before.prior.setpoints_um))

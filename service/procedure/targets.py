@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from case_record.record import CaseRecord
 from case_record.rows import Event
 from service.procedure.calibration import Calibration, FoundBy
-from service.procedure.guide_geometry import GuideGeometry, state_on_line
+from service.procedure.fiducials import GuideGeometry, state_on_line
 from service.procedure.kinematics import KinematicsError, line_from_entry_and_target
 from service.procedure.plane import ImagePlane
 from service.procedure.scan_frame import ScanFrame, other_place_since, places_good_since

@@ -11,8 +11,8 @@ from case_record.record import CaseRecord
 from robot_bridge.client.client import BridgeStatus
 from room_config.load import Config
 from room_config.service import GuideConfig
+from service.procedure.arguments import gate_of
 from service.procedure.calibration import Calibration
-from service.procedure.fiducial_plan import gate_of
 from service.procedure.identity import ProofArguments
 from service.procedure.initial_estimate import is_proven, start_point
 from service.procedure.plan import Travel

@@ -26,8 +26,6 @@ from case_record.rows import Procedure
 from room_config.load import Config
 from service.procedure.approach import Arrival
 from service.procedure.calibration import Calibration
-from service.procedure.guide_approach import GuideArrival
-from service.procedure.guide_recording import GuidePlace
 from service.procedure.observe import ProcedureFailedError
 from service.procedure.recording import Place
 from service.procedure.registry import build_procedure, result_to_json
@@ -52,7 +50,7 @@ from service.room.state_view import Describer, ProcessLook, describe_robot
 from service.room.stop_latch import StopLatch
 from service.room.trouble import RECORD_FAULTS, Trouble, held
 
-_TICK_S = 0.002
+_TICK_S = 0.01
 _HOLD_TICK_S = 0.02
 _TRIED_AGAIN_S = 0.5
 _SAID_AGAIN_S = 60.0
@@ -389,38 +387,37 @@ class ControlLoop:
 
     def _finish_procedure(self, running: Procedure, result: Any) -> None:
         body = {"procedure_id": running.procedure_id, "name": running.name}
-        if isinstance(result, Arrival | GuideArrival) and not self._record.doubt:
-            measurement_id = int(result.to_json()["measurement_id"])
-            doubt = doubt_of_arrival(self._record, running.procedure_id, measurement_id)
+        if isinstance(result, Arrival) and not self._record.doubt:
+            doubt = doubt_of_arrival(self._record, running.procedure_id, result.measurement_id)
             self._doubts[self._record.case_dir] = self._record.doubt = doubt
         with self._record.transaction():
             self._record.end_procedure(running.procedure_id, "done", result_to_json(result))
-            if isinstance(result, Place | GuidePlace):
+            if isinstance(result, Place):
                 self._make_target(running, result)
             self._record.append_event("procedure_done", body, source="service")
         known = getattr(result, "calibration", result)
         if isinstance(known, Calibration):
             correct_counts(self._record, self._link, known)
 
-    def _make_target(self, recorded: Procedure, place: Place | GuidePlace) -> None:
+    def _make_target(self, recorded: Procedure, place: Place) -> None:
         """The place that was recorded is the target from now on; a needle's line has an entry."""
         who = recorded.arguments["by"]
-        if isinstance(place, GuidePlace):
-            entry = {"patient_mm": place.joint_mm, "procedure_id": recorded.procedure_id}
+        if place.needle is not None:
+            entry = {
+                "patient_mm": list(place.needle.joint_mm),
+                "procedure_id": recorded.procedure_id,
+            }
             self._record.append_event(ENTRY_SET, entry, source="service", who=who)
-            patient_mm = place.tip_mm
-        else:
-            found = self._record.measurement(place.calibration.measurement_id).result or {}
-            patient_mm = place.patient_mm(found)
+        measurement = self._record.measurement(place.calibration.measurement_id)
         body = {
-            "patient_mm": patient_mm,
+            "patient_mm": place.target_mm(measurement.result or {}),
             "label": recorded.arguments["label"],
             "in_water": False,
             "procedure_id": recorded.procedure_id,
-            "sigma_mm": place.to_json()["sigma_mm"],
+            "sigma_mm": place.sigma_mm,
             "found_by": place.calibration.found_by.to_json(),
         }
-        frame = frame_of(self._record, self._record.measurement(place.calibration.measurement_id))
+        frame = frame_of(self._record, measurement)
         if frame is not None:
             body["scan_frame"] = frame.to_json()
         self._record.append_event(TARGET_SET, body, source="service", who=who)

@@ -51,6 +51,11 @@ class Permitted:
         self._given_by = self._record.append_event(WENT_ON, body, source=source, who=who)
         self._interrupted = False
 
+    def confirm(self, status: BridgeStatus) -> None:
+        """Somebody confirms the move that was asked about, as the robot stands now."""
+        self._given, self._given_by = self.facts(status), self._record.last_event_id()
+        self._interrupted = False
+
     def interrupt(self) -> None:
         """The robot was stopped, disarmed or out of reach."""
         self._interrupted = True

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from service.procedure.arguments import approach_of
 from service.procedure.calibration import Calibration
-from service.procedure.fiducial_plan import approach_of
-from service.procedure.guide_plan import guide_approach_of
 from service.procedure.plan import PlanRefusedError, plan_move
 from service.procedure.registry import latest_calibration
 from service.procedure.targets import Target, TargetError, current_entry
@@ -41,18 +40,12 @@ def check_reach(room: RoomContext, plan: Plan, *, in_water: bool = False) -> Non
     newest = room.record.last_slice("assigned")
     header = {} if newest is None else newest.header
     config, travel = room.config, room.travel()
-    wanted: tuple[float, ...]
+    entry_mm = None if guide is None else entry_of(room, plan, start)
     try:
-        if guide is None:
-            travel_um = room.link.travel_um
-            wanted = approach_of(config, travel_um, start, target, header, 0).target_mm
-        else:
-            entry_mm = entry_of(room, plan, start)
-            told = guide_approach_of(config, guide, travel, start, entry_mm, target, header)
-            wanted = told.target_mm
+        told = approach_of(config, guide, travel, start, entry_mm, target, header, 0)
         plan_move(
             start.estimate,
-            np.array(wanted),
+            np.array(told.target_mm),
             start.jacobian,
             travel,
             measurement_id=start.measurement_id,

@@ -9,9 +9,8 @@ from numpy.typing import NDArray
 
 from case_record.record import CaseRecord
 from room_config.load import Config
-from service.procedure.fiducial_plan import gate_of
-from service.procedure.guide_geometry import GuideSeenWrongError, line_of_state
-from service.procedure.guide_plan import geometry_of
+from service.procedure.arguments import gate_of, geometry_of
+from service.procedure.fiducials import GuideSeenWrongError, line_of_state
 from service.procedure.registry import latest_calibration
 from service.room.state import ArrivalState, RoomState
 from service.slicer.messages import INVALID, TRANSFORM_STATUS, VALID, Message, transform

@@ -22,6 +22,10 @@ class Ask(_Body):
     by: str = Field(default="operator", min_length=1, max_length=64, description=_WHO)
 
 
+class FinishBody(Ask):
+    park: bool = Field(default=False, description="True: also park the drives.")
+
+
 class ResetBody(Ask):
     positions_um: dict[str, int] | None = Field(
         default=None,

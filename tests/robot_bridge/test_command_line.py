@@ -83,6 +83,8 @@ def test_a_jog_from_an_uncertain_position_is_refused(tmp_path: Path):
         uncertain = robot(room, "--yes", "jog", "xt", "1")
         assert uncertain.returncode == 3
         assert "position_uncertain" in uncertain.stderr
+        report = ["--config", str(room.config_file), "--json", "status"]
+        assert fields(in_this_process(report))["positions_um"] == dict.fromkeys(AXES, "unknown")
 
 
 def test_stop_latches_and_rearm_clears_it(shared_room: BridgeRoom):

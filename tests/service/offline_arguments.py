@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from service.procedure.approach import ApproachArguments
+from service.procedure.aim import ApproachArguments
 from service.procedure.calibration import Calibration, CalibrationArguments
 from service.procedure.observe import ValidationGate
 from sr_engine.reconstruction.shiftset import named

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from offline_arguments import approach_arguments, beside, calibration_arguments
 
-from service.procedure.approach import SteeredFiducial, approach
+from service.procedure.approach import approach
 from service.procedure.calibration import calibrate
 from service.procedure.estimate import FiducialEstimate
 from service.procedure.observe import CONFIRM, REJECT, ProcedureFailedError
@@ -178,11 +178,11 @@ def test_h11_when_only_the_other_object_is_left_nothing_is_believed(calibrated):
 
 
 def test_more_slices_only_where_they_decide():
-    fiducial = SteeredFiducial(approach_arguments((0.0, 0.0)))
+    arguments = approach_arguments((0.0, 0.0))
 
     def wanted(error_mm, sigma_mm):
         estimate = FiducialEstimate({}, np.array([error_mm, 0.0]), np.eye(2) * sigma_mm**2)
-        return fiducial.frames_wanted(estimate, 1)
+        return arguments.frames_wanted(estimate, 1)
 
     assert wanted(0.0, 0.01) == 1
     assert wanted(0.0, 0.03) == 2

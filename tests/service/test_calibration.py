@@ -7,10 +7,11 @@ import pytest
 from offline_arguments import GATE, calibration_arguments
 
 from service.procedure.calibration import calibrate
+from service.procedure.fiducials import ONE_FIDUCIAL
 from service.procedure.jacobian import CalibrationError
 from service.procedure.observe import ProcedureFailedError, move
 from service.procedure.steps import MoveTo
-from service.procedure.strategies import STRATEGIES, look_at_fiducial
+from service.procedure.strategies import STRATEGIES, look
 from simulator.config import Fiducial, StaticObject, VirtualRoom
 from simulator.stage_physics import StageParameters
 from sr_engine.reconstruction.shiftset import named
@@ -108,14 +109,15 @@ def test_the_native_jacobian_scaled_is_the_one_of_super_resolution_images(calibr
         estimate = calibration.estimate.moved_to(
             moved.readback_um, calibration.jacobian, GATE.noise
         )
-        look = yield from look_at_fiducial(
+        here = yield from look(
+            ONE_FIDUCIAL,
             STRATEGIES["sr"].fine,
             replace(calibration, estimate=estimate),
             GATE,
             seed=(1, number),
             fresh=True,
         )
-        return look.found.plane_mm / 0.5  # in pixels of the SR image
+        return here.found.plane_mm / 0.5  # in pixels of the SR image
 
     places = [ORIGIN, {"xt": 15_000, "yt": 0}, {"xt": 15_000, "yt": 15_000}]
     first, second, third = (room.run(seen_with_sr(p, n)) for n, p in enumerate(places))

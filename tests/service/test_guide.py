@@ -9,24 +9,21 @@ from offline_arguments import GATE
 
 from case_record.record import CaseRecord
 from service.cli.replay import replay_measurements, replay_procedure
-from service.procedure.calibration import Calibration
-from service.procedure.guide_approach import GuideApproachArguments, approach_guide
-from service.procedure.guide_calibration import GuideCalibrationArguments, calibrate_guide
-from service.procedure.guide_geometry import (
+from service.procedure.aim import ApproachArguments
+from service.procedure.approach import approach
+from service.procedure.calibration import Calibration, CalibrationArguments, calibrate
+from service.procedure.fiducials import (
     GuideGeometry,
     GuideSeenWrongError,
+    judged_point,
     line_of_state,
     state_on_line,
-    tip_of,
 )
-from service.procedure.guide_recording import GuideRecordingArguments, record_guide
 from service.procedure.observe import REJECT, ProcedureFailedError
-from service.procedure.registry import (
-    GUIDE_APPROACH,
-    GUIDE_CALIBRATION,
-    guide_approach_arguments,
-    guide_calibration_arguments,
-)
+from service.procedure.recording import RecordingArguments, record_place
+from service.procedure.registry import GUIDE_APPROACH, GUIDE_CALIBRATION
+from service.procedure.registry import approach_arguments as recorded_approach
+from service.procedure.registry import calibration_arguments as recorded_calibration
 from service.procedure.targets import needle_line
 from simulator.config import Fiducial, VirtualRoom
 from simulator.mr_slice import slice_geometry
@@ -55,10 +52,11 @@ def calibration_arguments(**changes):
         "axes": AXES,
         "origin_um": dict.fromkeys(AXES, 0),
         "move_um": 6000,
+        "shifts_px": (),
         "geometry": GEOMETRY,
         "gate": GATE,
     }
-    return GuideCalibrationArguments(**{**values, **changes})
+    return CalibrationArguments(**{**values, **changes})
 
 
 def approach_arguments(target_mm, **changes):
@@ -73,7 +71,7 @@ def approach_arguments(target_mm, **changes):
         "confirm_moves": True,
         "gate": GATE,
     }
-    return GuideApproachArguments(**{**values, **changes})
+    return ApproachArguments(**{**values, **changes})
 
 
 def make_room(seed, room=ROOM, **options):
@@ -97,25 +95,25 @@ def true_state(room):
 @pytest.fixture(scope="module")
 def recorded():
     room = make_room(0)
-    return room.run(calibrate_guide(calibration_arguments())).to_json()
+    return room.run(calibrate(calibration_arguments())).to_json()
 
 
 @pytest.fixture
 def calibrated(recorded):
     """The same room again, as it stands after its calibration."""
     room = make_room(0)
-    return room, room.run(calibrate_guide(calibration_arguments()))
+    return room, room.run(calibrate(calibration_arguments()))
 
 
 @pytest.mark.parametrize("same_mount", [True, False])
 def test_a_calibration_is_held_against_the_last_one_of_this_robot(recorded, same_mount):
     again = calibration_arguments(last=recorded["jacobian"], same_mount=same_mount)
     for seed in range(1, 4):
-        make_room(seed).run(calibrate_guide(again))
+        make_room(seed).run(calibrate(again))
     other = make_room(5)
     other.nominal_step_um["xb"] = 4.5 / 0.8  # an axis that goes a fifth less far than it did
     with pytest.raises(ProcedureFailedError, match=r"axis xb.*differs from the last calibration"):
-        other.run(calibrate_guide(again))
+        other.run(calibrate(again))
 
 
 def test_the_tip_is_linear_in_what_is_seen():
@@ -155,16 +153,16 @@ def test_the_tip_80_mm_below_the_lower_plane_is_as_wrong_as_its_covariance_says(
     normalised, errors, frames = [], [], []
     for seed in range(5):
         room = make_room(seed)
-        calibration = room.run(calibrate_guide(calibration_arguments()))
+        calibration = room.run(calibrate(calibration_arguments()))
         home = calibration.estimate.plane_mm
         rng = np.random.default_rng(seed)
         for _ in range(6):
             target = home + rng.uniform(-3.0, 3.0, 4)
             wanted = GEOMETRY.tip_from_fiducials @ target
             before = room.frames
-            arrival = room.run(approach_guide(approach_arguments(target), calibration))
+            arrival = room.run(approach(approach_arguments(target), calibration))
             calibration = arrival.calibration
-            tip, covariance = tip_of(GEOMETRY, calibration.estimate)
+            tip, covariance = judged_point(GEOMETRY, calibration.estimate)
             miss = true_tip(room) - tip
             normalised.append(miss @ np.linalg.solve(covariance, miss))
             errors.append(np.linalg.norm(true_tip(room) - wanted))
@@ -199,19 +197,19 @@ def test_fiducials_above_the_top_plane_work_as_well():
     geometry = GuideGeometry(*along, APART, (58.0 - APART + along[0], 58.0 - APART + along[1]))
     room = make_room(1, room_model)
     # the levers are long: stay within the field of view and near the vertical
-    calibration = room.run(calibrate_guide(calibration_arguments(geometry=geometry, move_um=4000)))
+    calibration = room.run(calibrate(calibration_arguments(geometry=geometry, move_um=4000)))
     target = calibration.estimate.plane_mm + np.array([1.0, -2.0, 0.5, 0.5])
     changed = approach_arguments(target, geometry=geometry)
-    arrival = room.run(approach_guide(changed, calibration))
+    arrival = room.run(approach(changed, calibration))
     assert arrival.probability >= 0.95
-    assert np.linalg.norm(arrival.tip_error_mm) < 0.25
+    assert arrival.error_mm < 0.25
 
 
 def test_swapped_fiducials_are_noticed_in_the_calibration():
     swapped = replace(GEOMETRY, slice_positions_mm=GEOMETRY.slice_positions_mm[::-1])
     room = make_room(0)
     with pytest.raises(ProcedureFailedError, match="appear to be swapped") as failure:
-        room.run(calibrate_guide(calibration_arguments(geometry=swapped)))
+        room.run(calibrate(calibration_arguments(geometry=swapped)))
     assert failure.value.code == "fiducials_swapped"
     assert len(room.moves) == 5  # and not moved any further
 
@@ -223,7 +221,7 @@ def test_fiducials_swapped_after_the_calibration_stop_the_approach(calibrated):
     moves = len(room.moves)
     target = calibration.estimate.plane_mm + 1.0
     with pytest.raises(ProcedureFailedError):
-        room.run(approach_guide(approach_arguments(target, geometry=swapped), calibration))
+        room.run(approach(approach_arguments(target, geometry=swapped), calibration))
     assert len(room.moves) <= moves + 1
 
 
@@ -233,15 +231,26 @@ def test_a_lost_fiducial_is_said_so(calibrated):
     moves = len(room.moves)
     target = calibration.estimate.plane_mm + 1.0
     with pytest.raises(ProcedureFailedError, match="no usable measurement"):
-        room.run(approach_guide(approach_arguments(target), calibration))
+        room.run(approach(approach_arguments(target), calibration))
     assert len(room.moves) == moves + 1
+
+
+def test_slices_turned_since_the_calibration_are_refused_before_anything_moves(calibrated):
+    room, calibration = calibrated
+    turned = replace(PLANE, row_direction=PLANE.col_direction, col_direction=PLANE.row_direction)
+    recording = RecordingArguments(sigma_mm=0.05, gate=GATE, geometry=GEOMETRY)
+    moves = len(room.moves)
+    with pytest.raises(ProcedureFailedError, match="orientation differs") as failure:
+        room.run(record_place(recording, replace(calibration, plane=turned)))
+    assert failure.value.code == "plane_changed"
+    assert len(room.moves) == moves
 
 
 def test_an_axis_that_does_not_move_is_named():
     room = make_room(0)
     room.stages["xb"].apply_load(1.05)  # beyond what the motor can push
     with pytest.raises(ProcedureFailedError, match=r"axis xb: .* moved 0\.00 mm per mm"):
-        room.run(calibrate_guide(calibration_arguments()))
+        room.run(calibrate(calibration_arguments()))
 
 
 def test_a_line_out_of_reach_moves_nothing(calibrated):
@@ -249,7 +258,7 @@ def test_a_line_out_of_reach_moves_nothing(calibrated):
     moves = len(room.moves)
     target = calibration.estimate.plane_mm + np.array([0.0, 30.0, 0.0, 0.0])
     with pytest.raises(ProcedureFailedError, match="outside its travel"):
-        room.run(approach_guide(approach_arguments(target), calibration))
+        room.run(approach(approach_arguments(target), calibration))
     assert len(room.moves) == moves
 
 
@@ -259,7 +268,7 @@ def test_a_rejected_move_is_not_made(calibrated):
     room.setpoints_um = dict(calibration.estimate.setpoints_um)
     target = calibration.estimate.plane_mm + 1.0
     with pytest.raises(ProcedureFailedError, match="rejected by operator"):
-        room.run(approach_guide(approach_arguments(target), calibration))
+        room.run(approach(approach_arguments(target), calibration))
     assert room.moves == []
 
 
@@ -279,10 +288,10 @@ def test_a_recorded_case_of_four_axes_replays_to_the_last_bit(tmp_path):
     with CaseRecord(tmp_path, create=True) as record:
         room = RecordedRoom(record, MrImaging(ROOM), StageParameters(), 3, axes=AXES)
         calibration = room.run_recorded(
-            GUIDE_CALIBRATION, guide_calibration_arguments(calibration_arguments())
+            GUIDE_CALIBRATION, recorded_calibration(calibration_arguments())
         )
         target = calibration.estimate.plane_mm + np.array([1.0, -1.5, 0.5, 1.0])
-        approached = guide_approach_arguments(approach_arguments(target), calibration)
+        approached = recorded_approach(approach_arguments(target), calibration)
         arrival = room.run_recorded(GUIDE_APPROACH, approached)
         wanted = GEOMETRY.tip_from_fiducials @ target
         assert np.linalg.norm(true_tip(room) - wanted) < 0.25
@@ -297,16 +306,19 @@ def test_a_recorded_line_is_where_the_guide_truly_points_as_well_as_it_says():
     misses = []
     for seed in range(12):
         room = make_room(seed)
-        calibration = room.run(calibrate_guide(calibration_arguments()))
-        recording = GuideRecordingArguments(GEOMETRY, LOWER_PLANE, 0.05, GATE)
-        place = room.run(record_guide(recording, calibration))
+        calibration = room.run(calibrate(calibration_arguments()))
+        recording = RecordingArguments(
+            sigma_mm=0.05, gate=GATE, geometry=GEOMETRY, lower_plane_mm=LOWER_PLANE
+        )
+        place = room.run(record_place(recording, calibration))
         assert place.sigma_mm < 0.05
-        assert place.tip_below_joint_mm == BELOW
+        needle = place.needle
+        assert needle.tip_below_joint_mm == BELOW
         assert place.frames >= 2
-        miss = (np.array(place.tip_mm) - true_guide(room).at(-BELOW))[[0, 2]]
+        miss = (np.array(needle.tip_mm) - true_guide(room).at(-BELOW))[[0, 2]]
         misses.append(float(np.linalg.norm(miss)) / place.sigma_mm)
-        needle = needle_line(place.joint_mm, place.tip_mm, PLANE, LOWER_PLANE, LOWER_PLANE + APART)
-        assert needle.state(GEOMETRY, PLANE) == pytest.approx(place.calibration.estimate.plane_mm)
+        line = needle_line(needle.joint_mm, needle.tip_mm, PLANE, LOWER_PLANE, LOWER_PLANE + APART)
+        assert line.state(GEOMETRY, PLANE) == pytest.approx(place.calibration.estimate.plane_mm)
     assert 0.6 < np.sqrt(np.mean(np.square(misses)) / 2) < 1.6  # of 24 normal numbers
 
 

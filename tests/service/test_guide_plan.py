@@ -5,8 +5,8 @@ from test_guide import APART, LOWER, PLANE, UPPER, make_room
 from test_guide import calibration_arguments as guide_calibration
 
 from room_config.load import Config, ConfigError, load_config
-from service.procedure.guide_calibration import calibrate_guide
-from service.procedure.guide_plan import geometry_of, guide_approach_of, guide_calibration_of
+from service.procedure.arguments import approach_of, calibration_of, geometry_of
+from service.procedure.calibration import calibrate
 from service.procedure.plan import PlanRefusedError, Travel
 from service.procedure.targets import Target, TargetError
 
@@ -45,7 +45,7 @@ def configured(tmp_path, text: str = ROOM) -> Config:
 
 @pytest.fixture(scope="module")
 def start():
-    return make_room(2).run(calibrate_guide(guide_calibration()))
+    return make_room(2).run(calibrate(guide_calibration()))
 
 
 def test_the_configuration_becomes_the_geometry_of_the_procedures(tmp_path):
@@ -59,20 +59,20 @@ def test_the_configuration_becomes_the_geometry_of_the_procedures(tmp_path):
 def test_a_calibration_starts_in_the_middle_of_the_travel(tmp_path):
     config = configured(tmp_path)
     travel = {**TRAVEL, "xb": Travel(-10_000, 16_000)}
-    arguments = guide_calibration_of(config, config.service.guide, travel)
+    arguments = calibration_of(config, config.service.guide, travel, 1)
     assert arguments.origin_um == {"xt": 0, "yt": 0, "xb": 3000, "yb": 0}
     assert arguments.move_um == 6000
     with pytest.raises(PlanRefusedError, match="axis yb"):
-        guide_calibration_of(config, config.service.guide, {**TRAVEL, "yb": Travel(0, 4000)})
+        calibration_of(config, config.service.guide, {**TRAVEL, "yb": Travel(0, 4000)}, 1)
     two = {axis: TRAVEL[axis] for axis in ("xt", "yt")}
     with pytest.raises(PlanRefusedError, match="axis xb has no travel limits"):
-        guide_calibration_of(config, config.service.guide, two)
+        calibration_of(config, config.service.guide, two, 1)
 
 
 def test_the_tip_is_judged_at_the_target(tmp_path, start):
     config = configured(tmp_path)
     entry, target = (6.0, -22.0, -19.0), Target(1, (6.0, -82.0, -19.0))
-    arguments = guide_approach_of(config, config.service.guide, TRAVEL, start, entry, target, {})
+    arguments = approach_of(config, config.service.guide, TRAVEL, start, entry, target, {}, 1)
     assert arguments.geometry.tip_beyond_mm == pytest.approx(80.0)
     upper, lower = arguments.target_mm[:2], arguments.target_mm[2:]
     assert upper == pytest.approx(lower)  # an upright needle: both fiducials above the target
@@ -83,10 +83,11 @@ def test_a_target_in_tissue_shifts_both_fiducials_alike(tmp_path, start):
     config = configured(tmp_path)
     entry, at = (6.0, -22.0, -19.0), (9.0, -82.0, -22.0)
     oil, water = (
-        guide_approach_of(
+        approach_of(
             *(config, config.service.guide, TRAVEL, start, entry),
             Target(1, at, in_water=in_water),
             HEADER,
+            1,
         )
         for in_water in (False, True)
     )
@@ -106,7 +107,7 @@ def test_a_target_in_tissue_shifts_both_fiducials_alike(tmp_path, start):
 def test_a_target_that_no_needle_of_this_guide_reaches_is_refused(tmp_path, start, entry, at, said):
     config = configured(tmp_path)
     with pytest.raises(TargetError, match=said):
-        guide_approach_of(config, config.service.guide, TRAVEL, start, entry, Target(1, at), HEADER)
+        approach_of(config, config.service.guide, TRAVEL, start, entry, Target(1, at), HEADER, 1)
 
 
 @pytest.mark.parametrize(

@@ -21,6 +21,7 @@ from pynetdicom.sop_class import SpatialFiducialsStorage
 
 from case_record.record import CaseRecord
 from service.client import RefusedByServiceError, RoomClient
+from service.room.proposals import ProposalState
 from service.room.state import RoomState
 from service.slicer.messages import HEADER, TO_RAS, Message, Point, points
 
@@ -37,6 +38,16 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Iterator[AttendedRoom]:
 @pytest.fixture(scope="module")
 def port(room: AttendedRoom) -> int:
     return int(room.family.children["service"].ready["openigtlink"].rpartition(":")[2])
+
+
+def open_proposals(client: RoomClient) -> list[ProposalState]:
+    return [one for one in client.state().proposals if one.state == "open"]
+
+
+def refuse_all(client: RoomClient) -> None:
+    """Whatever the tests before have proposed: no more than eight may wait."""
+    for one in open_proposals(client):
+        client.refuse_proposal(one.number)
 
 
 def beside(state: RoomState, right_mm: float) -> tuple[float, float, float]:
@@ -192,7 +203,7 @@ def test_two_stations_that_propose_at_once_are_both_seen_and_told_apart(room, po
         other.say("transform", "TGT_1", *_pose(beside(here, 2.0)))
         for screen in (one, other):
             screen.wait_for(target_status)
-        waiting = [p for p in client.state().proposals if p.state == "open"]
+        waiting = open_proposals(client)
         assert len({p.sender for p in waiting}) == 2
         for proposal in waiting:
             client.refuse_proposal(proposal.number)
@@ -305,6 +316,7 @@ def test_every_message_in_every_phase_changes_nothing_without_the_operator(room,
     order = random.Random(seed)
     with RoomClient(room.url, by="Olga") as client, station("own", port) as screen:
         tidied(client)
+        refuse_all(client)
         stop_all(client)
         state = calibrated(client)
         client.set_target(beside(state, 4.0))
@@ -335,6 +347,7 @@ def test_every_message_in_every_phase_changes_nothing_without_the_operator(room,
         everything(5)
         assert client.state().robot.positions_um == positions
         client.answer(asked.question_id, "confirm", asked.plan["plan_id"])
+        wait_for(client.state, lambda s: s.robot.phase == "MOVE_TO_TARGET")
         everything(6)
         wait_for(client.state, lambda s: s.procedure is None or s.question is not None, 120.0)
         client.stop()
@@ -406,9 +419,8 @@ def test_a_plan_by_dicom_is_a_proposal_like_the_others(room, port):
 
 def test_a_proposal_is_refused_and_another_accepted_by_clicking(room, port, browser):
     with RoomClient(room.url, by="Olga") as client, station("own", port) as screen:
-        for left in calibrated(client).proposals:  # of the tests before
-            if left.state == "open":
-                client.refuse_proposal(left.number)
+        calibrated(client)
+        refuse_all(client)
         page = browser.new_page(viewport={"width": 1280, "height": 800})
         page.goto(room.url)
         card = page.locator("#proposals")

@@ -225,7 +225,8 @@ def test_a_case_that_has_ended_leaves_nothing_behind_even_if_it_is_opened_again(
         room.call("puncture")
         room.call("needle_out")
         assert room.later().error is not None
-        room.call("finish_case")
+        room.call("finish_case", park=True)
+        assert room.line.stage.parked
         state = room.later()
         assert not state.ready
         for shown in (

@@ -10,8 +10,6 @@ from test_guide import calibration_arguments as guide_calibration
 from case_record.record import CaseRecord
 from service.procedure.approach import approach
 from service.procedure.calibration import calibrate
-from service.procedure.guide_approach import approach_guide
-from service.procedure.guide_calibration import calibrate_guide
 from service.procedure.targets import (
     Target,
     TargetError,
@@ -115,13 +113,13 @@ def test_a_fiducial_target_needs_no_header():
 
 def test_entry_and_target_are_met_by_the_needles_line():
     room = make_room(7)
-    calibration = room.run(calibrate_guide(guide_calibration()))
+    calibration = room.run(calibrate(guide_calibration()))
     joint_y = float(true_guide(room).point_mm[1])
     entry, target = (6.0, joint_y - 20.0, -19.0), (9.0, joint_y - 80.0, -22.0)
     needle = needle_line(entry, target, PLANE, joint_y, joint_y + APART)
     assert needle.joint_mm - needle.depth_mm * needle.direction == pytest.approx(target)
     state = needle.state(GEOMETRY, PLANE)
-    room.run(approach_guide(guide_arguments(state), calibration))
+    room.run(approach(guide_arguments(state), calibration))
     line = true_guide(room)
     assert line.distance_to_mm(target) < 0.25
     assert line.distance_to_mm(entry) < 0.15

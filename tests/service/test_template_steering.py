@@ -8,14 +8,14 @@ from offline_arguments import GATE, approach_arguments, beside, calibration_argu
 
 from case_record.record import CaseRecord
 from service.cli.replay import replay_measurements, replay_procedure
-from service.procedure.approach import SteeredFiducial, approach
+from service.procedure.approach import approach
 from service.procedure.calibration import BY_DISC, FoundBy, calibrate
-from service.procedure.observe import ProcedureFailedError, measure_here
+from service.procedure.fiducials import ONE_FIDUCIAL
+from service.procedure.observe import ProcedureFailedError, see
 from service.procedure.recording import RecordingArguments, record_place
 from service.procedure.registry import APPROACH, CALIBRATION
 from service.procedure.registry import approach_arguments as recorded_approach
 from service.procedure.registry import calibration_arguments as recorded_calibration
-from service.procedure.steering import why_never_sure
 from service.procedure.targets import Target, common_part_mm
 from simulator.config import CANNULATED, Fiducial, SliceProtocol, VirtualRoom
 from simulator.stage_physics import StageParameters
@@ -45,9 +45,9 @@ def test_what_is_no_disc_is_calibrated_steered_and_placed_truly():
     for seed in range(6):
         room = offline(seed)
         start = room.run(calibrate(BY_TEMPLATE))
-        assert len(start.template_of()) == 4
+        assert len(start.found_by.template_of(0)) == 4
         before = room.true_plane_mm
-        there = room.run(record_place(RecordingArguments("adaptive", 0.012, GATE), start))
+        there = room.run(record_place(RecordingArguments(sigma_mm=0.012, gate=GATE), start))
         first_mm, target_mm = room.true_plane_mm, there.calibration.estimate.plane_mm
         assert np.array_equal(before, first_mm)
         away = room.run(
@@ -111,9 +111,8 @@ def test_the_record_alone_says_what_template_a_case_was_steered_by(recorded):
 def test_slices_of_another_protocol_are_not_fitted_by_it_and_said_to_be(recorded):
     start = recorded.run_recorded(CALIBRATION, recorded_calibration(BY_TEMPLATE))
     other_bandwidth(recorded)
-    _, seen = recorded.run(
-        measure_here("ml", GATE.around(start.estimate), fresh=True, template=start.template_of())
-    )
+    expected, templates = GATE.around(start.estimate), start.found_by.templates
+    (seen,) = recorded.run(see(ONE_FIDUCIAL, "ml", expected, templates, fresh=True)).measured
     assert seen.method == "ml"
     result = recorded.record.last_measurement("done").result
     assert "a different pixel bandwidth (130 instead of 260)" in result["why_no_template"]
@@ -145,9 +144,9 @@ def test_another_thing_in_its_place_is_refused_by_name_with_what_to_do():
     room.imaging = MrImaging(
         VirtualRoom(fiducials=(Fiducial(radius_mm=5.5, cannula_mm=9.0),), protocol=PROTOCOL)
     )
-    expected, template = GATE.around(start.estimate), start.template_of()
+    expected, templates = GATE.around(start.estimate), start.found_by.templates
     with pytest.raises(ProcedureFailedError, match="calibrate again") as refused:
-        room.run(measure_here("ml", expected, fresh=True, template=template))
+        room.run(see(ONE_FIDUCIAL, "ml", expected, templates, fresh=True))
     assert refused.value.code == "template-mismatch"
 
 
@@ -164,6 +163,6 @@ def test_of_the_absolute_centre_counts_what_the_targets_kind_says():
     judged = told.as_judged(start.estimate).covariance_mm2 - start.estimate.covariance_mm2
     assert np.allclose(judged, np.diag([0.0009, 0.0016]))
     # 0.06 mm cannot be said of a place in tissue with that, 0.1 mm can
-    assert "known to 0.040 mm" in why_never_sure(told, SteeredFiducial(told).is_sure)
+    assert "known to 0.040 mm" in told.why_never_sure()
     wider = replace(told, tolerance_mm=0.1)
-    assert why_never_sure(wider, SteeredFiducial(wider).is_sure) == ""
+    assert wider.why_never_sure() == ""

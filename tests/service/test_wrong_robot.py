@@ -18,9 +18,8 @@ from case_record.rows import Move
 from service.client import RoomClient
 from service.procedure.approach import approach
 from service.procedure.calibration import calibrate
-from service.procedure.guide_calibration import _check_shares
-from service.procedure.guide_geometry import GuideGeometry
-from service.procedure.jacobian import ImageJacobian
+from service.procedure.fiducials import GuideGeometry
+from service.procedure.jacobian import CalibrationError, ImageJacobian
 from service.procedure.observe import ABORT, RESCAN, ProcedureFailedError
 from service.procedure.steps import AskOperator, Moved, MoveTo
 from service.room.state import RoomState
@@ -207,9 +206,9 @@ def guide_jacobian(*directions: tuple[float, float]) -> ImageJacobian:
     ],
 )
 def test_two_axes_of_a_stage_that_act_alike_are_refused_at_the_calibration(directions, named):
-    with pytest.raises(ProcedureFailedError, match=named):
-        _check_shares(guide_jacobian(*directions), GUIDE)
-    _check_shares(guide_jacobian((0, 1), (1, 0), (0.1, 1), (1, -0.1)), GUIDE)
+    with pytest.raises(CalibrationError, match=named):
+        GUIDE.check(guide_jacobian(*directions))
+    GUIDE.check(guide_jacobian((0, 1), (1, 0), (0.1, 1), (1, -0.1)))
 
 
 # The same in running processes: what the stages truly do is what the motors' truth port says.

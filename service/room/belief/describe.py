@@ -12,6 +12,7 @@ from case_record.record import CaseRecord
 from case_record.rows import Measurement, Procedure
 from room_config.load import Config
 from room_config.service import STRATEGIES
+from service.procedure.aim import frames_that_decide
 from service.procedure.estimate import FiducialEstimate, probability_within
 from service.procedure.registry import (
     APPROACH,
@@ -19,7 +20,6 @@ from service.procedure.registry import (
     GUIDE_CALIBRATION,
     latest_calibration,
 )
-from service.procedure.steering import frames_that_decide
 from service.room.belief.goal import bounds_of, effective, goal_tolerance_mm
 from service.room.belief.state import (
     AxisBelief,

@@ -42,9 +42,10 @@ class CaseCommands:
         """Only where none is open."""
         return self.begin_case(by)
 
-    def finish_case(self, by: str) -> str:
-        """Nothing moves in this case any more: disarm, and close it.
+    def finish_case(self, by: str, park: bool = False) -> str:
+        """Nothing moves in this case any more: disarm, take the power off if wished, and close it.
 
+        park: the drives as well, which a robot out of reach refuses.
         Return the name of its folder. The needle must be out, and no procedure may run.
         """
         room, cases = self._room, self._life.cases
@@ -58,19 +59,23 @@ class CaseCommands:
                 "needle_in",
                 "The needle may be in: confirm that it is withdrawn, then finish the case.",
             )
-        self._disarm(by)
+        self._disarm(by, park)
         with room.record.transaction():
             room.record.end_open_hold(time.time())
             room.note(FINISHED, by, {"linked": status is not None})
         cases.set_open(None)
         return room.record.case_dir.name
 
-    def _disarm(self, by: str) -> None:
+    def _disarm(self, by: str, park: bool) -> None:
         """Without a link there is nothing to disarm: the bridge has stopped by itself."""
         client, status = self._room.link.client, self._room.link.status
         if status is None:
+            if park:
+                raise ConflictError("no_link", "The case stays open: no link to park the drives.")
             return
         try:
+            if park and not status.parked:
+                client.set_drives(on=False, by=by)
             if status.armed:
                 client.disarm(by)
         except BridgeError as error:

@@ -2,17 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from typing import Any
 
 from case_record.cases import Cases
-from room_config.service import GuideConfig
-from service.procedure.approach import SteeredFiducial
-from service.procedure.estimate import FiducialEstimate
-from service.procedure.fiducial_plan import approach_of, calibration_of
-from service.procedure.guide_approach import SteeredGuide
-from service.procedure.guide_plan import guide_approach_of, guide_calibration_of
+from service.procedure.arguments import approach_of, calibration_of
 from service.procedure.observe import CONFIRM
 from service.procedure.plan import PLAN_VOID, PlanRefusedError
 from service.procedure.registry import (
@@ -22,11 +17,8 @@ from service.procedure.registry import (
     GUIDE_CALIBRATION,
     approach_arguments,
     calibration_arguments,
-    guide_approach_arguments,
-    guide_calibration_arguments,
 )
 from service.procedure.scan_frame import newest_frame
-from service.procedure.steering import SteeringArguments, why_never_sure
 from service.procedure.targets import (
     Target,
     TargetError,
@@ -52,25 +44,15 @@ class ProcedureCommands:
     def start_calibration(self, by: str, guide: bool | None = None) -> int:
         """Begin a calibration; returns its procedure id. guide: four axes; None: as configured."""
         self._room.check_may_start()
-        with_guide = self._room.guide_wanted(guide)
-        if with_guide is not None:
-            return self._start_guide_calibration(with_guide, by)
+        room, with_guide = self._room, self._room.guide_wanted(guide)
         try:
-            arguments = calibration_of(self._room.config, self._room.travel(), self._room.seed())
+            arguments = calibration_of(room.config, with_guide, room.travel(), room.seed())
         except PlanRefusedError as error:
             raise ConflictError("out_of_travel", f"Calibration: {error}.") from error
-        last, same_mount = last_jacobian(self._room.record, self._cases, CALIBRATION)
+        name = GUIDE_CALIBRATION if with_guide else CALIBRATION
+        last, same_mount = last_jacobian(room.record, self._cases, name)
         arguments = replace(arguments, last=last, same_mount=same_mount)
-        return self._room.begin(CALIBRATION, calibration_arguments(arguments), by)
-
-    def _start_guide_calibration(self, guide: GuideConfig, by: str) -> int:
-        try:
-            arguments = guide_calibration_of(self._room.config, guide, self._room.travel())
-        except PlanRefusedError as error:
-            raise ConflictError("out_of_travel", f"Calibration: {error}.") from error
-        last, same_mount = last_jacobian(self._room.record, self._cases, GUIDE_CALIBRATION)
-        arguments = replace(arguments, last=last, same_mount=same_mount)
-        return self._room.begin(GUIDE_CALIBRATION, guide_calibration_arguments(arguments), by)
+        return room.begin(name, calibration_arguments(arguments), by)
 
     def start_approach(self, by: str, guide: bool | None = None) -> int:
         """Begin the approach to the target; returns its procedure id.
@@ -78,54 +60,38 @@ class ProcedureCommands:
         guide: with four axes, to the line from entry to target; None: as configured.
         """
         self._room.check_may_start()
-        with_guide = self._room.guide_wanted(guide)
-        if with_guide is not None:
-            return self._start_guide_approach(with_guide, by)
-        start = self._room.start_point()
-        target = self._target()
-        try:
-            arguments = approach_of(
-                self._room.settings(),
-                self._room.link.travel_left_um,
-                start,
-                target,
-                self._newest_header(),
-                self._room.seed(),
-                proven=self._room.is_proven(start),
-            )
-        except TargetError as error:
-            raise _unusable(error) from error
-        _refuse_hopeless(arguments, SteeredFiducial(arguments).is_sure)
-        body = {**approach_arguments(arguments, start), "target": target.number}
-        body["scan_frame"] = self._scan_frame()
-        return self._room.begin(APPROACH, body, by)
-
-    def _start_guide_approach(self, guide: GuideConfig, by: str) -> int:
-        start = self._room.start_point(guide=True)
-        target, entry_mm = self._target(), current_entry(self._room.record)
-        if entry_mm is None:
+        room, with_guide = self._room, self._room.guide_wanted(guide)
+        start = room.start_point(guide=with_guide is not None)
+        target, entry_mm = self._target(), current_entry(room.record)
+        if with_guide is not None and entry_mm is None:
             raise ConflictError(
                 "no_entry", "Set an entry point first: it gives the needle its direction."
             )
+        settings = room.settings()
         try:
-            settings = self._room.settings()
-            arguments = guide_approach_of(
+            arguments = approach_of(
                 settings,
-                settings.service.guide or guide,
-                self._room.travel(),
+                settings.service.guide if with_guide else None,
+                room.travel(),
                 start,
                 entry_mm,
                 target,
                 self._newest_header(),
-                proven=self._room.is_proven(start),
+                room.seed(),
+                proven=room.is_proven(start),
             )
         except TargetError as error:
-            raise _unusable(error) from error
-        _refuse_hopeless(arguments, SteeredGuide(arguments).is_sure)
-        entry = current_entry_number(self._room.record)
-        body = {**guide_approach_arguments(arguments, start), "target": target.number}
-        body["entry"], body["scan_frame"] = entry, self._scan_frame()
-        return self._room.begin(GUIDE_APPROACH, body, by)
+            raise ConflictError(
+                "target_unusable", f"The target cannot be used: {error}."
+            ) from error
+        if why := arguments.why_never_sure():
+            raise ConflictError("tolerance_too_tight", f"Not started: {why}.")
+        body = {**approach_arguments(arguments, start), "target": target.number}
+        body["scan_frame"] = self._scan_frame()
+        if with_guide is None:
+            return room.begin(APPROACH, body, by)
+        body["entry"] = current_entry_number(room.record)
+        return room.begin(GUIDE_APPROACH, body, by)
 
     def _target(self) -> Target:
         target = current_target(self._room.record)
@@ -222,14 +188,3 @@ class ProcedureCommands:
             "by_hand": arrival_by_hand(self._room.record, found.procedure_id),
         }
         self._room.note(PUNCTURE, by, body)
-
-
-def _refuse_hopeless(
-    arguments: SteeringArguments, is_sure: Callable[[FiducialEstimate], bool]
-) -> None:
-    if why := why_never_sure(arguments, is_sure):
-        raise ConflictError("tolerance_too_tight", f"Not started: {why}.")
-
-
-def _unusable(error: TargetError) -> ConflictError:
-    return ConflictError("target_unusable", f"The target cannot be used: {error}.")

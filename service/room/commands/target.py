@@ -6,8 +6,7 @@ import math
 from collections.abc import Sequence
 from typing import Any
 
-from service.procedure.fiducial_plan import recording_of
-from service.procedure.guide_plan import guide_recording_of
+from service.procedure.arguments import recording_of
 from service.procedure.registry import APPROACHES, GUIDE_RECORDING, RECORDING, recording_arguments
 from service.procedure.scan_frame import newest_frame
 from service.procedure.targets import (
@@ -109,17 +108,12 @@ class TargetCommands:
         With two fiducials the needle's line does: entry point and target.
         """
         self._room.check_may_start()
-        guide = self._room.guide_wanted(None)
-        if guide is not None:
-            start = self._room.start_point(guide=True)
-            proof = self._room.proof_arguments(start)
-            told = recording_arguments(guide_recording_of(self._room.config, guide, proof), start)
-            return self._room.begin(GUIDE_RECORDING, {**told, "label": label, "by": by}, by)
-        start = self._room.start_point()
-        proof = self._room.proof_arguments(start)
-        arguments = recording_of(self._room.settings(), self._room.seed(), proof)
+        room, settings = self._room, self._room.settings()
+        guide = settings.service.guide
+        start = room.start_point(guide=guide is not None)
+        arguments = recording_of(settings, guide, room.seed(), room.proof_arguments(start))
         body = {**recording_arguments(arguments, start), "label": label, "by": by}
-        return self._room.begin(RECORDING, body, by)
+        return room.begin(RECORDING if guide is None else GUIDE_RECORDING, body, by)
 
     def set_entry(self, patient_mm: Sequence[float], by: str) -> None:
         """Set the planned skin point, patient mm (LPS)."""

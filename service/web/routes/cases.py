@@ -12,7 +12,7 @@ from service.room.state import HeldState
 from service.web.orders import REFUSALS, REFUSALS_WITH_ID, Caller, Key, Orders
 from service.web.pagination import ERRORS
 from service.web.papers import Papers
-from service.web.schemas import Ask, CaseBegun, CaseBody, StudyBody
+from service.web.schemas import Ask, CaseBegun, CaseBody, FinishBody, StudyBody
 
 Folder = Annotated[
     str,
@@ -31,7 +31,7 @@ def case_router(loop: ControlLoop, orders: Orders, papers: Papers) -> APIRouter:
         return CaseBegun(folder=orders.carry_out(caller, key, "begin_case", body))
 
     @router.post("/case/finish", responses=REFUSALS)
-    def finish(body: Ask, caller: Caller, key: Key = None) -> CaseBegun:
+    def finish(body: FinishBody, caller: Caller, key: Key = None) -> CaseBegun:
         """Finish the open case: the robot is disarmed, nothing of the case changes any more.
 
         The needle must be out, and no procedure may run. Report and export are written into the
