@@ -16,17 +16,10 @@ import structlog
 
 from service.room.proposals import Plan, ProposalState, Verdict
 from service.room.state import RoomState
-from service.slicer.answers import (
-    Answer,
-    acknowledge,
-    answer,
-    decision_of,
-    stop_word,
-    verdict_of,
-)
+from service.slicer.answers import Answer, acknowledge, answer, decision_of, verdict_of
 from service.slicer.messages import STATUS_NOT_READY, Message, status
 from service.slicer.pose import Pose
-from service.slicer.reading import Received, Stream
+from service.slicer.reading import Received, Stream, stop_word
 from service.slicer.scene import Scene, status_of
 
 _PATIENCE_S = 5.0
@@ -122,6 +115,7 @@ class Peer:
     # What it says
 
     async def _read(self) -> None:
+        front, since_s = -1, 0.0
         while True:
             patience_s = _HALF_A_MESSAGE_S if self._stream.is_waiting else None
             try:
@@ -132,6 +126,12 @@ class Peer:
                 if not data:
                     return
                 messages = self._stream.feed(data)
+            now_s = time.monotonic()
+            if self._stream.front != front:
+                front, since_s = self._stream.front, now_s
+            elif self._stream.is_waiting and now_s - since_s > _HALF_A_MESSAGE_S:
+                messages += self._stream.resume()
+                since_s = now_s
             for message in messages:
                 self._note_version(message.version)
                 word = stop_word(message)
