@@ -109,7 +109,8 @@ class Intake:
             slice_ = self._slice_of(row)
             if slice_ is None:
                 continue
-            self._clocks.observe(slice_, row.received_s)
+            is_fresh = row.header["envelope"].get("is_fresh", True)
+            self._clocks.observe(slice_, row.received_s, is_fresh=is_fresh)
             if row.state == "pending":
                 self._pending[row.slice_id] = slice_
                 self._note_clockless(row.slice_id, row.reason_code)
@@ -254,7 +255,8 @@ class Intake:
             reason = _without_path(error.reason, path)
             return [row_without_header(envelope, name, reason)], [None]
         for slice_ in slices:
-            for kind, text in self._clocks.observe(slice_, envelope.received_s):
+            received_s, is_fresh = envelope.received_s, envelope.is_fresh
+            for kind, text in self._clocks.observe(slice_, received_s, is_fresh=is_fresh):
                 self.alarm(kind, text)
         rows: list[NewSlice] = []
         known = None

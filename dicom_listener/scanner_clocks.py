@@ -63,9 +63,11 @@ class ScannerClocks:
         self._standing: set[tuple[str, str]] = set()  # alarms that are raised once, while they last
         self._has_news = False
 
-    def observe(self, slice_: Slice, received_s: float) -> list[tuple[str, str]]:
+    def observe(
+        self, slice_: Slice, received_s: float, *, is_fresh: bool = True
+    ) -> list[tuple[str, str]]:
         """Take one more slice into account; return the alarms that it gives, as (kind, text)."""
-        received = _received(slice_, received_s)
+        received = _received(slice_, received_s, is_fresh=is_fresh)
         if received is None:
             return []
         scanner = slice_.scanner
@@ -144,7 +146,7 @@ class ScannerClocks:
         return news
 
 
-def _received(slice_: Slice, received_s: float) -> Received | None:
+def _received(slice_: Slice, received_s: float, *, is_fresh: bool = True) -> Received | None:
     if slice_.interval is None:
         return None
-    return Received(slice_.interval, received_s, slice_.clock_synchronized is True)
+    return Received(slice_.interval, received_s, slice_.clock_synchronized is True, is_fresh)

@@ -7,6 +7,7 @@ remembered by its hash, so that a restart takes nothing twice.
 """
 
 import io
+import math
 import os
 import struct
 import threading
@@ -28,6 +29,9 @@ from dicom_slice.quirks import MR_CLASSES
 SENDER = "watch_dir"
 _PART10_HEAD = 144  # preamble, DICM, and the element with the length of the meta group
 _UNDEFINED = 0xFFFFFFFF
+# what is seen so long after the look before, or was changed so long ago, may have lain there
+_LOOK_GAP_S = 2.0
+_OLD_S = 300.0
 _UNFINISHED = (".part", ".tmp", ".partial", ".filepart", ".crdownload")
 
 log = structlog.get_logger("listener")
@@ -39,12 +43,16 @@ class NotWholeError(ValueError):
 
 @dataclass(frozen=True)
 class Seen:
-    """A file as it was at one look: it is looked at again until it keeps still."""
+    """A file as it was at one look: it is looked at again until it keeps still.
+
+    is_fresh: it was not there, or not yet like this, at the look just before.
+    """
 
     size_bytes: int
     changed_ns: int
     since_s: float
     since_monotonic_s: float
+    is_fresh: bool
 
 
 class DropFolder:
@@ -72,6 +80,7 @@ class DropFolder:
         self._seen: dict[str, Seen] = {}
         self._done: dict[str, tuple[int, int]] = {}  # name: size and change of what is dealt with
         self._is_there = True
+        self._looked_s = -math.inf  # when the last look began that saw the folder, monotonic
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="watch_dir", daemon=True)
 
@@ -91,6 +100,7 @@ class DropFolder:
 
     def look(self) -> None:
         """One round over the folder: take what is whole, remember what may become so."""
+        began_s = time.monotonic()
         try:
             found = dict(self._files())
         except OSError as error:
@@ -108,6 +118,7 @@ class DropFolder:
         for name, (size, changed_ns) in found.items():
             if self._done.get(name) != (size, changed_ns):
                 self._consider(name, size, changed_ns)
+        self._looked_s = began_s
 
     def _files(self) -> Iterator[tuple[str, tuple[int, int]]]:
         """(name relative to the folder, (size, time of change)) of all that may be slices."""
@@ -127,7 +138,7 @@ class DropFolder:
     def _consider(self, name: str, size: int, changed_ns: int) -> None:
         seen = self._seen.get(name)
         if seen is None or (seen.size_bytes, seen.changed_ns) != (size, changed_ns):
-            self._seen[name] = Seen(size, changed_ns, time.time(), time.monotonic())
+            self._seen[name] = self._first_seen(size, changed_ns)
             return
         still_s = time.monotonic() - seen.since_monotonic_s
         if still_s < self._still_s:
@@ -149,6 +160,12 @@ class DropFolder:
         self._done[name] = size, changed_ns
         del self._seen[name]
 
+    def _first_seen(self, size: int, changed_ns: int) -> Seen:
+        now_s, now_monotonic_s = time.time(), time.monotonic()
+        is_recent = now_s - changed_ns * 1e-9 < _OLD_S
+        is_fresh = is_recent and now_monotonic_s - self._looked_s < _LOOK_GAP_S
+        return Seen(size, changed_ns, now_s, now_monotonic_s, is_fresh)
+
     def _take(self, name: str, seen: Seen) -> None:
         raw = (self._folder / name).read_bytes()
         data_set, body = whole_file(raw)
@@ -167,6 +184,7 @@ class DropFolder:
             sop_instance_uid=str(data_set.get("SOPInstanceUID", "")),
             sha256=digest,
             size_bytes=len(body),
+            is_fresh=seen.is_fresh,
         )
         path = self._inbox.store(body, envelope)
         self._taken.add(digest)

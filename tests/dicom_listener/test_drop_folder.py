@@ -67,6 +67,28 @@ def test_a_whole_file_is_taken_once_with_the_instant_at_which_it_was_first_seen(
     assert again.stored == []
 
 
+def test_only_a_file_that_appears_while_the_folder_is_watched_is_fresh(tmp_path, watching):
+    def freshness(name: str, changed_s: float | None = None) -> bool:
+        path = watching.share / name
+        path.write_bytes(file_bytes(tmp_path, f"1.2.{name}"))
+        if changed_s is not None:
+            os.utime(path, (changed_s, changed_s))
+        watching.look()
+        return read_envelope(watching.stored[-1])[0].is_fresh
+
+    assert not freshness("1")  # it lay there at the start
+    assert freshness("2")
+    assert not freshness("3", time.time() - 3600)
+    away = watching.share.rename(tmp_path / "away")
+    watching.look(1)
+    (away / "4").write_bytes(file_bytes(tmp_path, "1.2.4"))
+    watching.drop_folder._looked_s -= 60  # that the share was gone for
+    away.rename(watching.share)
+    watching.look()
+    assert not read_envelope(watching.stored[-1])[0].is_fresh
+    assert len(watching.stored) == 4
+
+
 def test_a_file_that_is_being_written_is_taken_when_it_is_whole(tmp_path, watching):
     raw = file_bytes(tmp_path, "1.2.3")
     path = watching.share / "a.dcm"

@@ -2,6 +2,7 @@
 
 import os
 import time
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelo
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.operator_actions import give_up_slices, reset_clock, sync_clock
+from dicom_listener.promptness import Promptness
 from dicom_listener.retention import remove_old
 from dicom_slice.eligibility import SliceRules
 from dicom_slice.quirks import ENHANCED_MR_IMAGE
@@ -93,6 +95,71 @@ def enhanced(n_frames: int, began_s: float) -> Dataset:
         frames.append(frame)
     data_set.PerFrameFunctionalGroupsSequence = Sequence(frames)
     return data_set
+
+
+def stack(place: int, began_s: float) -> Dataset:
+    """One slice of a stack, in an object of its own."""
+    data_set = mr_data_set(f"1.2.7.{place}", began_s=began_s)
+    data_set.ImagePositionPatient = [-20, 10 + 5 * place, 24]
+    data_set.InstanceNumber = place + 1
+    return data_set
+
+
+def series(place: int, began_s: float) -> Dataset:
+    """One of several short acquisitions that are pushed together."""
+    data_set = stack(place, began_s + 0.3 * place)
+    data_set.AcquisitionDuration, data_set.AcquisitionNumber = 0.2, place + 1
+    return data_set
+
+
+@pytest.mark.parametrize("made", [stack, series])
+@pytest.mark.parametrize("held_up_s", [15.0, 86400.0])
+def test_what_comes_late_at_once_bears_no_witness_to_its_own_promptness(make_desk, made, held_up_s):
+    desk = make_desk(clock=ClockRules(promptness=Promptness(0.0, 2.0)), comparison=None)
+    now_s = time.time()
+    begin_hold(desk.record, now_s - held_up_s / 2, expected=5)
+    for place in range(5):
+        desk.receive(made(place, now_s - held_up_s - 2.0), received_s=now_s + 0.2 * place)
+    assert {row.reason_code for row in desk.record.slices()} == {"clock_unknown"}
+    assert "each for itself" in desk.record.slices()[0].reason
+
+
+def test_the_frames_of_a_late_object_bear_no_witness_to_their_own_promptness(make_desk):
+    desk = make_desk(clock=ClockRules(promptness=Promptness(0.0, 2.0)), comparison=None)
+    begin_hold(desk.record, time.time() - 10, expected=5)
+    rows = desk.receive(enhanced(5, time.time() - 20.5))
+    assert {row.reason_code for row in rows} == {"clock_unknown"}
+
+
+@pytest.mark.parametrize("is_fresh", [True, False])
+def test_files_that_may_have_lain_there_bear_no_witness_to_promptness(make_desk, is_fresh):
+    desk = make_desk(clock=ClockRules(promptness=Promptness(0.0, 2.0)), comparison=None)
+    now_s = time.time()
+    begin_hold(desk.record, now_s - 50, expected=5)
+    for place in range(5):
+        sent = stack(place, now_s - 40 + 8 * place)
+        sent.AcquisitionNumber = place + 1
+        desk.receive(sent, received_s=now_s - 39 + 8 * place, is_fresh=is_fresh)
+    states = {row.state for row in desk.record.slices()}
+    assert states == ({"assigned"} if is_fresh else {"pending"})
+
+
+@pytest.mark.parametrize("says_start", [True, False])
+def test_a_reference_within_the_hold_does_not_hide_a_start_before_it(make_desk, says_start):
+    desk = make_desk(clock=ClockRules(unseen_steps=False))
+    now_s = time.time()
+    begin_hold(desk.record, now_s - 12)
+    sent = enhanced(1, now_s - 20)
+    del sent.AcquisitionDuration
+    if not says_start:
+        del sent.AcquisitionDateTime
+    content = Dataset()
+    content.FrameReferenceDateTime = f"{datetime.fromtimestamp(now_s - 10):%Y%m%d%H%M%S.%f}"
+    sent.PerFrameFunctionalGroupsSequence[0].FrameContentSequence = Sequence([content])
+    (row,) = desk.receive(sent)
+    assert row.state == "quarantined"
+    assert ("before" if says_start else "unknown duration") in row.reason
+    assert row.time_source == ("AcquisitionDateTime" if says_start else "")
 
 
 def test_every_frame_of_one_object_is_a_slice_of_the_hold(make_desk):

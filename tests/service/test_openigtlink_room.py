@@ -350,6 +350,7 @@ def test_every_message_in_every_phase_changes_nothing_without_the_operator(room,
         everything(5)
         assert client.state().robot.positions_um == positions
         client.answer(asked.question_id, "confirm", asked.plan["plan_id"])
+        wait_for(client.state, lambda s: s.robot.phase == "MOVE_TO_TARGET")
         everything(6)
         wait_for(client.state, lambda s: s.procedure is None or s.question is not None, 120.0)
         client.stop()

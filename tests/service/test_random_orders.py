@@ -16,7 +16,7 @@ from line_room import ORIGIN_MM, LineRoom, patient_mm
 from case_record.record import CaseRecordError
 from service.room.readiness import ConflictError
 
-ORDERS, SOAK_ORDERS = 800, 2000
+ORDERS = 2000
 SOAK_SEEDS = range(100, 150)
 _MOVING_ORDERS = ("jog", "start_calibration", "start_approach", "record_target")
 
@@ -306,5 +306,5 @@ def test_orders_in_any_order_and_faults_in_between(tmp_path, monkeypatch):
 @pytest.mark.soak
 @pytest.mark.parametrize("seed", SOAK_SEEDS)
 def test_the_same_for_a_hundred_thousand_orders(tmp_path, monkeypatch, seed):
-    monkey = campaign(tmp_path, seed, SOAK_ORDERS, monkeypatch)
+    monkey = campaign(tmp_path, seed, ORDERS, monkeypatch)
     check_probability(monkey.readies.values())
