@@ -158,6 +158,12 @@ class ScannerClock:
             return ScannerClock((made,), set_at_s=made.at_s)
         return replace(self, comparisons=(*self.comparisons, made), suspicion="", lags_s=())
 
+    def doubted(self, text: str, *, is_certain: bool) -> "ScannerClock":
+        """With what slices have shown against it, in another case or before a restart."""
+        if is_certain:
+            return replace(self, contradicted=self.contradicted or text)
+        return replace(self, suspicion=self.suspicion or text)
+
     def bounds_for(self, slice_: Received, rules: ClockRules) -> Offset:
         """Between which bounds the offset lay when this slice was acquired."""
         against = self.contradicted or self.suspicion

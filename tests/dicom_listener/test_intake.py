@@ -13,6 +13,7 @@ from pydicom.dataset import Dataset
 from pydicom.sequence import Sequence
 from real_slices import DICOM
 
+from case_record.cases import Cases
 from case_record.record import CaseRecord
 from dicom_listener.clock import ClockRules, Comparison
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope, sha256_of
@@ -23,6 +24,7 @@ from dicom_listener.promptness import Promptness
 from dicom_listener.retention import remove_old
 from dicom_slice.eligibility import SliceRules
 from dicom_slice.quirks import ENHANCED_MR_IMAGE
+from service.room.cases.life import begin, reopen
 
 
 class Desk:
@@ -361,3 +363,73 @@ def test_a_clock_that_was_set_is_not_known_again_by_a_restart(make_desk):
         (row,) = room.receive(mr_data_set(f"1.2.{number}", began_s=time.time() - 0.6))
         assert (row.state, row.reason_code) == ("pending", "clock_unknown")
         assert "before the scanner's clock was set" in row.reason
+
+
+class RoomDesk(Desk):
+    """The listener's side of one case of a room, whose scanner's clock nobody sets."""
+
+    def __init__(self, folder: Path, filed: Comparison | None = None) -> None:
+        self.folder, self.record = folder, CaseRecord(folder)
+        self.inbox = Inbox(folder / "inbox")
+        self.rules = IntakeRules(clock=ClockRules(unseen_steps=False), comparison=filed)
+        self.intake = Intake(self.record, self.inbox, self.rules, ListenerMetrics())
+        begin_hold(self.record, time.time() - 15)
+
+    def restart(self) -> None:
+        self.intake.close()
+        self.intake = Intake(self.record, self.inbox, self.rules, ListenerMetrics())
+        self.intake.look_at_record()
+
+    def late_slice(self, number: int) -> str:
+        """Acquired before the hold, by a clock that is 30 s ahead: why it waits."""
+        sent = mr_data_set(f"1.2.1.{number}", began_s=time.time() - 10)
+        sent.AcquisitionNumber = number
+        (row,) = self.receive(sent)
+        assert row.state == "pending", row
+        return row.reason
+
+    def contradict(self, **changes) -> None:
+        self.receive(mr_data_set("1.2.1", began_s=time.time() + 29.4), **changes)
+
+
+def test_what_contradicts_a_comparison_counts_in_the_next_case_and_after_a_restart(tmp_path):
+    cases = Cases(tmp_path)
+    first = RoomDesk(begin(cases, "room", "op", {}))
+    sync_clock(first.record, 0.0, 0.2, "op")
+    first.intake.look_at_record()
+    first.contradict()
+    assert "ahead of the comparison" in first.late_slice(2)
+    second = RoomDesk(begin(cases, "room", "op", {}))
+    assert "ahead of the comparison" in second.late_slice(3)
+    second.restart()
+    assert "ahead of the comparison" in second.late_slice(4)
+    reopen(cases, first.folder.name, "op")
+    first.restart()
+    assert "ahead of the comparison" in first.late_slice(5)
+    sync_clock(first.record, -30.0, 0.2, "op")  # which ends it, in what comes next as well
+    third = RoomDesk(begin(cases, "room", "op", {}))
+    third.receive(mr_data_set("1.2.9", began_s=time.time() + 29.4))
+    assert third.record.last_slice("pending").reason.startswith("it may have been acquired before")
+
+
+def test_a_clock_that_was_set_in_one_case_was_set_in_the_next(tmp_path):
+    cases = Cases(tmp_path)
+    filed = Comparison(0.0, 0.2, time.time() - 600)
+    first = RoomDesk(begin(cases, "room", "op", {}), filed)
+    reset_clock(first.record, "op", "it was set")
+    second = RoomDesk(begin(cases, "room", "op", {}), filed)
+    assert "before the scanner's clock was set" in second.late_slice(1)
+    third = RoomDesk(begin(cases, "room", "op", {}), Comparison(-30.0, 0.2, time.time()))
+    assert "before the scanner's clock was set" in third.late_slice(2)
+
+
+def test_a_slice_that_was_taken_after_a_comparison_contradicts_it_after_a_restart_too(tmp_path):
+    desk = RoomDesk(begin(Cases(tmp_path), "room", "op", {}))
+    received_s = time.time()
+    sync_clock(desk.record, 0.0, 0.2, "op")
+    desk.contradict(received_s=received_s - 0.001)
+    told = desk.late_slice(2)
+    assert "ahead of the comparison" in told
+    desk.restart()
+    assert desk.late_slice(3) == told
+    assert "assigned" not in {row.state for row in desk.record.slices()}
