@@ -1,5 +1,6 @@
 """Plans that workstations send to the listener: noted in the record, for the service to propose."""
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,8 @@ def _places(record: CaseRecord, plan: PlanObject) -> dict[str, Any]:
         found = {_in_patient(record, point) for point in same}
         if None in found:
             return {"why": f"its {label} lies on an image that is not in this case"}
+        if not all(math.isfinite(value) for place, _ in filter(None, found) for value in place):
+            return {"why": f"its {label} is not three finite numbers"}
         if len(found) > 1:
             return {"why": f"{len(found)} points are labelled {label}"}
         for place, frame in filter(None, found):

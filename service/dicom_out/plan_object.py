@@ -22,6 +22,7 @@ from service.dicom_out.content import plan_events
 from service.dicom_out.errors import OutputError
 from service.dicom_out.identity import MAKER, SERIES_NUMBERS, software_version
 from service.dicom_out.source import frame_of_reference, tidy_patient
+from service.procedure.scan_frame import STUDY_ACCEPTED, places_good_since
 from service.procedure.targets import ENTRY_SET, TARGET_SET, TARGET_WITHDRAWN
 
 
@@ -35,7 +36,7 @@ def plan_of(record: CaseRecord, event_id: int) -> Dataset:
         record.case_dir / _slice_of(record, event).path, stop_before_pixels=True
     )
     tidy_patient(source)
-    frame = frame_of_reference(source)
+    frame = _frame_at(record, event) or frame_of_reference(source)
     at = datetime.fromtimestamp(event.wall_s)
     begun = datetime.fromtimestamp(case.created_s)
     study = str(source.StudyInstanceUID)
@@ -59,7 +60,7 @@ def plan_of(record: CaseRecord, event_id: int) -> Dataset:
         content_time=at.time(),
     )
     made.copy_patient_and_study_information(source)
-    for keyword in ("BodyPartExamined", "Laterality"):
+    for keyword in ("SpecificCharacterSet", "BodyPartExamined", "Laterality"):
         if keyword in source:
             made[keyword] = source[keyword]
     made.InstanceCreationDate, made.InstanceCreationTime = made.ContentDate, made.ContentTime
@@ -79,9 +80,17 @@ def _slice_of(record: CaseRecord, event: Event) -> SliceRow:
     return before[-1] if before else rows[0]
 
 
+def _frame_at(record: CaseRecord, event: Event) -> str:
+    """The frame of reference that a person accepted for the case before the event, if one did."""
+    accepted = [e for e in record.events_of_kind(STUDY_ACCEPTED) if e.seq <= event.seq]
+    return str(accepted[-1].body.get("frame_of_reference") or "") if accepted else ""
+
+
 def _places(record: CaseRecord, event: Event) -> list[tuple[str, Sequence[float]]]:
-    """What held right after the event; the operator's words for the target are no label."""
-    places = []
+    """What held right after the event, nothing of before the table moved; the operator's words for
+    the target are no label.
+    """
+    places, good_since = [], places_good_since(record, event.seq)
     for label, kinds in ((TARGET, (TARGET_SET, TARGET_WITHDRAWN)), (ENTRY, (ENTRY_SET,))):
         known = [e for kind in kinds for e in record.events_of_kind(kind)]
         last = max(
@@ -89,7 +98,7 @@ def _places(record: CaseRecord, event: Event) -> list[tuple[str, Sequence[float]
             key=lambda e: e.event_id,
             default=None,
         )
-        if last is not None and "patient_mm" in last.body:
+        if last is not None and last.seq > good_since and "patient_mm" in last.body:
             places.append((label, last.body["patient_mm"]))
     return places
 

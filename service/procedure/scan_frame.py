@@ -122,14 +122,17 @@ def _differ(mine: str, others: str) -> bool:
     return bool(mine) and bool(others) and mine != others
 
 
-def places_good_since(record: CaseRecord) -> int:
-    """The record's `seq` from which on places in the patient are still where they were.
+def places_good_since(record: CaseRecord, until_seq: int | None = None) -> int:
+    """The record's `seq` from which on places in the patient are still where they were, now or at
+    `until_seq`.
 
     A study that was accepted with another frame of reference is one to which nothing compares.
     """
     since, binding = 0, None
     events = [*record.events_of_kind(BOUND), *record.events_of_kind(ACCEPTED)]
     for event in sorted(events, key=lambda event: event.seq):
+        if until_seq is not None and event.seq > until_seq:
+            break
         before, binding = binding, after_event(binding, event.kind, event.body)
         if before is not None and binding is not None:
             frame = binding.frame_of_reference

@@ -1,5 +1,6 @@
 """Plans of workstations: points by label from three kinds of objects, in the right frame."""
 
+import math
 import time
 from pathlib import Path
 
@@ -167,6 +168,8 @@ def test_a_measurement_report_names_its_points_by_tracking_identifier(desk):
     [
         (presentation_state("9.9.9"), "on an image that is not in this case"),
         (spatial_fiducials(("TARGET", TARGET), ("Target", ENTRY)), "2 points are labelled TARGET"),
+        (spatial_fiducials(("TARGET", (1.0, math.nan, 3.0))), "TARGET is not three finite numbers"),
+        (spatial_fiducials(("ENTRY", (math.inf, 2.0, 3.0))), "ENTRY is not three finite numbers"),
     ],
 )
 def test_why_a_plan_cannot_be_placed_is_said(desk, made, why):
