@@ -132,7 +132,7 @@ class OpenIgtLinkServer:
             more = await asyncio.to_thread(self._from_record, self._read, {})
             self.scene = scene | more
             for peer in list(self._peers):
-                peer.look(state.proposals)
+                peer.look(state)
 
     def _read(self, state: RoomState, record: CaseRecord | None) -> Scene:
         pose = self._pose(state, record)
