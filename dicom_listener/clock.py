@@ -20,6 +20,7 @@ after `late_limit_s` before it came, whichever is later, if that is earlier than
 
 from dataclasses import dataclass, replace
 
+from dicom_listener.promptness import Promptness, Witness, with_witness
 from dicom_slice.times import AcquisitionInterval
 
 LAGS_KEPT = 10
@@ -28,20 +29,12 @@ _LAGS_THAT_SHOW_A_HABIT = 5
 
 
 @dataclass(frozen=True)
-class Promptness:
-    """How soon slices come after their acquisition has ended, as measured at this site."""
-
-    least_s: float
-    most_s: float
-
-
-@dataclass(frozen=True)
 class ClockRules:
     """What is known of a scanner, its network and of clocks.
 
     promptness: measured at this site; None: not measured, and nothing is believed of it.
-    witnesses: slices that must agree before promptness alone is believed: slices that were held up
-    do not come equally late.
+    witnesses: acquisitions, independent of each other, that must agree before promptness alone is
+    believed: those that were held up do not come equally late.
     longest_acquisition_s: no acquisition that comes without its duration lasts longer.
     late_limit_s: no slice comes later than this. One that seems to shows a clock that was set back,
     or a network that stood still, and nothing can tell which.
@@ -107,11 +100,16 @@ _WHAT_TO_DO, _SCAN_AGAIN = f"compare the clocks, {_CONFIRM}", f"scan again, {_CO
 
 @dataclass(frozen=True)
 class Received:
-    """One slice, as its clock sees it."""
+    """One slice, as its clock sees it.
+
+    is_fresh: it came when it was received; a file that lay in the drop folder may have come at any
+    time before, and bears no witness to promptness.
+    """
 
     interval: AcquisitionInterval
     received_s: float
     synchronized: bool = False
+    is_fresh: bool = True
 
     @property
     def most_lag_s(self) -> float:
@@ -135,8 +133,9 @@ class ScannerClock:
     set_at_s: until when the clock may have been set, by what somebody said or by comparisons that
     do not agree; nothing from before counts. contradicted: what slices prove against what was
     known; suspicion: what they make doubtful of it. Both stand until the next comparison.
-    least_lags (lag by the latest end, whether that is certain) and upper_s (the least lag by the
-    earliest end): over all slices since then. lags_s: of the last ones whose ends are certain.
+    witnesses (the least late of what came independently, by the latest end) and upper_s (the least
+    lag by the earliest end): over all slices since then. lags_s: of the last acquisitions whose
+    ends are certain.
     synchronized_since_s: since when all slices say that the clock is synchronized.
     """
 
@@ -144,7 +143,7 @@ class ScannerClock:
     set_at_s: float | None = None
     contradicted: str = ""
     suspicion: str = ""
-    least_lags: tuple[tuple[float, bool], ...] = ()
+    witnesses: tuple[Witness, ...] = ()
     upper_s: float | None = None
     lags_s: tuple[float, ...] = ()
     synchronized_since_s: float | None = None
@@ -158,6 +157,12 @@ class ScannerClock:
         if self.contradicted or not agrees:
             return ScannerClock((made,), set_at_s=made.at_s)
         return replace(self, comparisons=(*self.comparisons, made), suspicion="", lags_s=())
+
+    def doubted(self, text: str, *, is_certain: bool) -> "ScannerClock":
+        """With what slices have shown against it, in another case or before a restart."""
+        if is_certain:
+            return replace(self, contradicted=self.contradicted or text)
+        return replace(self, suspicion=self.suspicion or text)
 
     def bounds_for(self, slice_: Received, rules: ClockRules) -> Offset:
         """Between which bounds the offset lay when this slice was acquired."""
@@ -241,13 +246,13 @@ class ScannerClock:
         if not self.is_witnessed(rules) and self.by_comparison(slice_, rules) is None:
             return None
         lag_s = slice_.least_lag_s(rules)
-        if self.least_lags:
-            lag_s = min(lag_s, self.least_lags[0][0])
+        if self.witnesses:
+            lag_s = min(lag_s, self.witnesses[0].least_lag[0])
         return OffsetBounds(lag_s - rules.promptness.most_s, lag_s)
 
     def is_witnessed(self, rules: ClockRules) -> bool:
-        """Whether the least late slices came as nearly together as was measured."""
-        lags = self.least_lags[: rules.witnesses]
+        """Whether the least late acquisitions came as nearly equally late as was measured."""
+        lags = [one.least_lag for one in self.witnesses[: rules.witnesses]]
         if rules.promptness is None or len(lags) < rules.witnesses:
             return False
         range_s = rules.promptness.most_s - rules.promptness.least_s + rules.jump_tolerance_s
@@ -257,7 +262,10 @@ class ScannerClock:
 
     def _why_unknown(self, slice_: Received, rules: ClockRules) -> str:
         if rules.promptness is not None:
-            return f"no {rules.witnesses} slices arrived as promptly as was measured at this site"
+            return (
+                f"no {rules.witnesses} acquisitions arrived, each for itself, as promptly as was "
+                "measured at this site"
+            )
         if self.comparisons:
             age_min = abs(slice_.received_s - self.comparisons[-1].at_s) / 60
             return f"the clocks were compared {age_min:.0f} min away from it"
@@ -307,7 +315,7 @@ def _contradiction(clock: ScannerClock, slice_: Received, rules: ClockRules) -> 
             )
     if rules.promptness is not None and clock.is_witnessed(rules):
         spread_s = rules.promptness.most_s - rules.promptness.least_s
-        ahead_s = clock.least_lags[0][0] - spread_s - lag_s
+        ahead_s = clock.witnesses[0].least_lag[0] - spread_s - lag_s
         if ahead_s > rules.jump_tolerance_s:
             return f"the scanner's clock is at least {ahead_s:.1f} s ahead of its earlier time"
     return ""
@@ -375,17 +383,25 @@ def _unlike_measured(clock: ScannerClock, slice_: Received, rules: ClockRules) -
 
 
 def _with_lag(clock: ScannerClock, slice_: Received, rules: ClockRules) -> ScannerClock:
-    lag = slice_.least_lag_s(rules), is_certain(slice_.interval)
     upper_s = slice_.most_lag_s
     if clock.upper_s is not None:
         upper_s = min(clock.upper_s, upper_s)
-    return replace(
-        clock,
-        least_lags=tuple(sorted((*clock.least_lags, lag)))[: rules.witnesses],
-        upper_s=upper_s,
-        lags_s=(*clock.lags_s, lag[0])[-LAGS_KEPT:] if lag[1] else clock.lags_s,
-        synchronized_since_s=_synchronized_since_s(clock, slice_),
+    seen = replace(
+        clock, upper_s=upper_s, synchronized_since_s=_synchronized_since_s(clock, slice_)
     )
+    if not slice_.is_fresh:
+        return seen
+    lag_s, certain = slice_.least_lag_s(rules), is_certain(slice_.interval)
+    acquired_s = slice_.interval.start_s, earliest_end_s(slice_.interval)
+    received_s = slice_.received_s, slice_.received_s
+    new = Witness((lag_s, certain), acquired_s, received_s)
+    lags_s = clock.lags_s
+    if certain and lags_s and any(one.is_one_with(new) for one in clock.witnesses):
+        lags_s = (*lags_s[:-1], min(lags_s[-1], lag_s))
+    elif certain:
+        lags_s = (*lags_s, lag_s)[-LAGS_KEPT:]
+    witnesses = with_witness(clock.witnesses, new, rules.witnesses)
+    return replace(seen, witnesses=witnesses, lags_s=lags_s)
 
 
 def _synchronized_since_s(clock: ScannerClock, slice_: Received) -> float | None:

@@ -40,7 +40,10 @@ class NotFromInboxError(ValueError):
 
 @dataclass(frozen=True)
 class Envelope:
-    """How a data set came to us. Instants: our wall clock (s since the epoch) and monotonic."""
+    """How a data set came to us. Instants: our wall clock (s since the epoch) and monotonic.
+
+    is_fresh: it came at that instant; a file may have lain in the drop folder before.
+    """
 
     calling_ae_title: str
     called_ae_title: str
@@ -53,6 +56,7 @@ class Envelope:
     sop_instance_uid: str
     sha256: str
     size_bytes: int
+    is_fresh: bool = True
 
 
 def sha256_of(data: bytes) -> str:

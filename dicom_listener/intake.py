@@ -4,11 +4,10 @@ Runs in the listener's process, one file after the other. A file whose rows are 
 done; any other in the inbox is taken, also one that was received just before a crash.
 """
 
-import math
 import sqlite3
 import time
 from collections import deque
-from collections.abc import Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from datetime import tzinfo
 from pathlib import Path
@@ -34,7 +33,7 @@ from dicom_listener.holding_area import INBOX, Arrival
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.plans import PLAN_RECEIVED, plan_event
-from dicom_listener.scanner_clocks import ScannerClocks
+from dicom_listener.scanner_clocks import CLOCK_DOUBTED, ScannerClocks
 from dicom_listener.slice_rows import (
     outcome_of,
     row_of,
@@ -105,16 +104,32 @@ class Intake:
         """Rebuild from the record what an earlier run knew, in the order in which it came."""
         for row in self._record.slices():
             self._done.add(row.path)
-            self._read_events(replaying=True, until_s=row.received_s)
+            self._read_events(replaying=True, until=row)
             slice_ = self._slice_of(row)
             if slice_ is None:
                 continue
-            self._clocks.observe(slice_, row.received_s)
+            is_fresh = row.header["envelope"].get("is_fresh", True)
+            self._clocks.observe(slice_, row.received_s, is_fresh=is_fresh)
             if row.state == "pending":
                 self._pending[row.slice_id] = slice_
                 self._note_clockless(row.slice_id, row.reason_code)
             self._know(row.slice_id, slice_, row)
         self._read_events(replaying=True)
+        self._tell_doubts()
+
+    @property
+    def clock_doubts(self) -> list[dict[str, Any]]:
+        """What slices have shown against what is known of the scanners' clocks."""
+        return self._clocks.doubts
+
+    def recall_doubts(self, doubts: Iterable[Mapping[str, Any]]) -> None:
+        """What was seen in the case before counts in this one."""
+        self._clocks.recall(doubts)
+        self._tell_doubts()
+
+    def _tell_doubts(self) -> None:
+        for body in self._clocks.take_doubts():
+            self._event(CLOCK_DOUBTED, body)
 
     def _know(self, slice_id: int, slice_: Slice, row: NewSlice) -> None:
         """Keep a usable slice for the decisions to come.
@@ -254,8 +269,10 @@ class Intake:
             reason = _without_path(error.reason, path)
             return [row_without_header(envelope, name, reason)], [None]
         for slice_ in slices:
-            for kind, text in self._clocks.observe(slice_, envelope.received_s):
+            received_s, is_fresh = envelope.received_s, envelope.is_fresh
+            for kind, text in self._clocks.observe(slice_, received_s, is_fresh=is_fresh):
                 self.alarm(kind, text)
+        self._tell_doubts()
         rows: list[NewSlice] = []
         known = None
         if before:
@@ -315,6 +332,8 @@ class Intake:
         return [window_of(hold, hold.hold_id in self._confirmed) for hold in holds]
 
     def _write(self, rows: list[NewSlice], slices: list[Slice | None], envelope: Envelope) -> None:
+        heeded = {"heeded_event": self._seen_event_id}
+        rows = [replace(row, header={**row.header, **heeded}) for row in rows]
         with self._record.transaction():
             stored = [self._record.add_slice(row) for row in rows]
             self._event("slice_received", _event_body(rows, envelope))
@@ -345,10 +364,13 @@ class Intake:
 
     # What the other processes say
 
-    def _read_events(self, *, replaying: bool, until_s: float = math.inf) -> None:
-        """Heed what was not heeded yet, of what was recorded until an instant."""
+    def _read_events(self, *, replaying: bool, until: SliceRow | None = None) -> None:
+        """Heed what was not heeded yet; or what had been when a slice was taken.
+
+        Whatever the clocks said then: in the order of the record.
+        """
         while self._unheeded or self._fetch_events():
-            if self._unheeded[0].wall_s > until_s:
+            if until is not None and not _was_heeded_for(until, self._unheeded[0]):
                 return
             event = self._unheeded.popleft()
             self._heed(event, replaying)
@@ -454,6 +476,12 @@ class Intake:
 
     def _event(self, kind: str, body: dict[str, Any]) -> None:
         self._record.append_event(kind, body, source=SOURCE)
+
+
+def _was_heeded_for(row: SliceRow, event: Event) -> bool:
+    """Whether an event counted when a slice was taken; records of before do not say."""
+    heeded = row.header.get("heeded_event")
+    return event.seq < row.seq if heeded is None else event.event_id <= heeded
 
 
 def window_of(hold: Hold, confirmed: bool) -> HoldWindow:

@@ -17,13 +17,14 @@ from case_record.cases import Cases
 from case_record.presence import Presence, Sole
 from case_record.record import CaseRecord, CaseRecordError
 from dicom_listener.assign import AssignRules
-from dicom_listener.clock import ClockRules, Comparison, Promptness
+from dicom_listener.clock import ClockRules, Comparison
 from dicom_listener.holding_area import INBOX
 from dicom_listener.inbox import Inbox
 from dicom_listener.intake import IntakeRules
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.network.commitment import Commitment, KeptInstances
 from dicom_listener.network.drop_folder import DropFolder
+from dicom_listener.promptness import Promptness
 from dicom_listener.reception import Reception
 from dicom_listener.retention import remove_old
 from dicom_listener.scp import Scp, ScpRules, tls_context

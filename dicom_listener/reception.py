@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import time
 from pathlib import Path
+from typing import Any
 
 import structlog
 
@@ -40,6 +41,8 @@ class Reception:
         self._unusable: Path | None = None
         self._again_s = 0.0
         self._gate: CaseGate | None = None
+        # a new case has what the service brought into it; not what came in the meantime
+        self._doubts: list[dict[str, Any]] = []
         self.record: CaseRecord | None = None
         self.intake: Intake | None = None
         if self._area is not None:
@@ -95,10 +98,12 @@ class Reception:
         self._unusable = None
         self._gate = CaseGate(self.record, self._area)
         self.intake = Intake(self.record, self._inbox, self._rules, self._metrics, self._gate)
+        self.intake.recall_doubts(self._doubts)
         log.info("case", folder=str(folder))
 
     def _leave(self) -> None:
         if self.intake is not None:
+            self._doubts = self.intake.clock_doubts
             self.intake.close()
         if self.record is not None:
             self.record.close()

@@ -1,6 +1,7 @@
 """What is known of the clocks of the scanners that send to us, by scanner."""
 
-from collections.abc import Mapping
+import math
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -17,6 +18,7 @@ from dicom_listener.clock import (
 )
 from dicom_slice.header import Slice
 
+CLOCK_DOUBTED = "clock_doubted"
 _WHAT_TO_DO = {
     kind: "; compare the clocks"
     for kind in ("clock_jump", "late_or_clock_jump", "push_delay_unlike_measured", "clock_drift")
@@ -51,27 +53,40 @@ class Drift:
 
 
 class ScannerClocks:
-    """Learns from every slice, and from what operators say: a comparison, or a reset."""
+    """Learns from every slice, and from what operators say: a comparison, or a reset.
+
+    What slices prove against a comparison goes into the record (`take_doubts`, CLOCK_DOUBTED): it
+    is known of the room's scanner, whichever case comes next.
+    """
 
     def __init__(self, rules: ClockRules, comparison: Comparison | None) -> None:
         self._rules = rules
-        self._unseen = ScannerClock()  # of a scanner that has not sent yet
-        if comparison is not None:
-            self._unseen = self._unseen.compared(comparison, rules)
+        self._filed = comparison  # in the room's file
+        self._unseen = self._with_filed(ScannerClock())  # of a scanner that has not sent yet
+        self._doubts: dict[str, dict[str, Any]] = {}  # that stand, by scanner
+        self._untold: set[str] = set()  # of those, whose the record does not have
         self._clocks: dict[str, ScannerClock] = {}
         self._drifts: dict[str, Drift] = {}
         self._standing: set[tuple[str, str]] = set()  # alarms that are raised once, while they last
         self._has_news = False
 
-    def observe(self, slice_: Slice, received_s: float) -> list[tuple[str, str]]:
+    def observe(
+        self, slice_: Slice, received_s: float, *, is_fresh: bool = True
+    ) -> list[tuple[str, str]]:
         """Take one more slice into account; return the alarms that it gives, as (kind, text)."""
-        received = _received(slice_, received_s)
+        received = _received(slice_, received_s, is_fresh=is_fresh)
         if received is None:
             return []
         scanner = slice_.scanner
         before = self._clock(scanner)
         seen = observe(before, received, self._rules)
         self._clocks[scanner] = seen.clock
+        text = seen.clock.contradicted or seen.clock.suspicion
+        if text and text != (before.contradicted or before.suspicion):
+            is_sure = bool(seen.clock.contradicted)
+            doubt = {"scanner": scanner, "text": text, "is_certain": is_sure, "at_s": received_s}
+            self._doubts[scanner] = doubt
+            self._untold.add(scanner)
         is_new = not before.is_witnessed(self._rules) and seen.clock.is_witnessed(self._rules)
         self._has_news |= is_new
         drift = self._drifts.get(scanner, Drift())
@@ -121,18 +136,62 @@ class ScannerClocks:
         """Follow an event of the record, where it concerns clocks."""
         if kind == "clock_sync":
             made = Comparison(body["offset_s"], body["uncertainty_s"], body["at_s"])
-            self._unseen = self._unseen.compared(made, self._rules)
+            self._unseen = self._with_filed(self._unseen.compared(made, self._rules), made.at_s)
             self._clocks = {
-                name: clock.compared(made, self._rules) for name, clock in self._clocks.items()
+                name: self._with_filed(clock.compared(made, self._rules), made.at_s)
+                for name, clock in self._clocks.items()
             }
         elif kind == "clock_reset":
-            self._unseen = ScannerClock(set_at_s=wall_s)
+            set_at_s = body.get("at_s", wall_s)  # what was said in an earlier case has an instant
+            self._unseen = self._with_filed(ScannerClock(set_at_s=set_at_s), set_at_s)
             self._clocks.clear()
+        elif kind == CLOCK_DOUBTED:
+            self._doubt(body)
+            return
         else:
             return
+        self._doubts.clear()
+        self._untold.clear()
         self._drifts.clear()
         self._standing.clear()
         self._has_news = True
+
+    def _with_filed(self, clock: ScannerClock, since_s: float = -math.inf) -> ScannerClock:
+        """The clock after what the room's file says, if the clocks were compared since then."""
+        if self._filed is None or self._filed.at_s <= since_s:
+            return clock
+        return clock.compared(self._filed, self._rules)
+
+    def _doubt(self, body: Mapping[str, Any]) -> None:
+        if self._filed is not None and self._filed.at_s > body["at_s"]:
+            return
+        scanner = body["scanner"]
+        clock = self._clock(scanner)
+        self._clocks[scanner] = clock.doubted(body["text"], is_certain=body["is_certain"])
+        self._doubts[scanner] = dict(body)
+        self._untold.discard(scanner)
+
+    @property
+    def doubts(self) -> list[dict[str, Any]]:
+        """What stands against what was known, in words for the record."""
+        return list(self._doubts.values())
+
+    def take_doubts(self) -> list[dict[str, Any]]:
+        """Of those, what the record does not have yet."""
+        untold = [self._doubts[scanner] for scanner in self._untold]
+        self._untold.clear()
+        return untold
+
+    def recall(self, doubts: Iterable[Mapping[str, Any]]) -> None:
+        """What was seen in the case before, if nobody has compared or reset the clocks since."""
+        for body in doubts:
+            clock = self._clock(body["scanner"])
+            told_s = [made.at_s for made in clock.comparisons] + [clock.set_at_s or -math.inf]
+            if body["scanner"] in self._doubts or max(told_s) > body["at_s"]:
+                continue
+            self._doubt(body)
+            if body["scanner"] in self._doubts:
+                self._untold.add(body["scanner"])
 
     @property
     def has_news(self) -> bool:
@@ -144,7 +203,7 @@ class ScannerClocks:
         return news
 
 
-def _received(slice_: Slice, received_s: float) -> Received | None:
+def _received(slice_: Slice, received_s: float, *, is_fresh: bool = True) -> Received | None:
     if slice_.interval is None:
         return None
-    return Received(slice_.interval, received_s, slice_.clock_synchronized is True)
+    return Received(slice_.interval, received_s, slice_.clock_synchronized is True, is_fresh)

@@ -2,7 +2,9 @@
 
 Order of sources: FrameReferenceDateTime, FrameAcquisitionDateTime, AcquisitionDateTime,
 AcquisitionDate with AcquisitionTime. Content, series, instance creation and trigger times are
-never looked at. The interval is never made shorter than what the header can prove.
+never looked at. FrameReferenceDateTime is no start, but an instant within the acquisition: where
+the duration is not certain, the start is taken from the others, or there is none. The interval is
+never made shorter than what the header can prove.
 """
 
 import re
@@ -16,6 +18,9 @@ from dicom_slice.quirks import ge_duration_s, whole_duration_s
 _EARLIEST_YEAR = 1990  # de-identified headers say 0001 or 1900
 _DAY = timedelta(days=1)
 _MOST_HOURS = 14
+_ROUNDED_S = 0.01
+_REFERENCE, _OF_FRAME = "FrameReferenceDateTime", "FrameAcquisitionDateTime"
+_OF_ALL = "AcquisitionDateTime"
 
 
 @dataclass(frozen=True)
@@ -57,18 +62,26 @@ def acquisition_interval(frame: FrameElements, times: TimeFrame) -> AcquisitionI
     """
     duration_s, estimated = _duration_s(frame)
     found = _Instants(frame, times)
-    reference = found.of_frame("FrameReferenceDateTime")
-    acquisition = found.of_frame("FrameAcquisitionDateTime")
-    if reference is not None:
-        return found.told(_around(reference, acquisition, duration_s, estimated))
-    if acquisition is not None:
-        return found.told(_from(acquisition, duration_s, "FrameAcquisitionDateTime", estimated))
-    start_s = found.read("AcquisitionDateTime", frame.top.text("AcquisitionDateTime"))
-    if start_s is not None:
-        return found.told(_from(start_s, duration_s, "AcquisitionDateTime", estimated))
-    start_s = found.date_and_time()
-    if start_s is not None:
-        return found.told(_from(start_s, duration_s, "AcquisitionDate+AcquisitionTime", estimated))
+    reference_s = found.of_frame(_REFERENCE)
+    if reference_s is None:
+        begun = next(found.starts(), None)
+        if begun is not None:
+            start_s, source = begun
+            end_s = None if duration_s is None else start_s + duration_s
+            return found.told(AcquisitionInterval(start_s, end_s, source, estimated))
+    elif duration_s is not None and not estimated:
+        return found.told(_around(reference_s, found.of_frame(_OF_FRAME), duration_s))
+    else:
+        for start_s, source in found.starts():
+            if start_s <= reference_s + _ROUNDED_S:
+                start_s = min(start_s, reference_s)
+                end_s = None if duration_s is None else max(reference_s, start_s + duration_s)
+                source = _REFERENCE if source == _OF_FRAME else source
+                return found.told(AcquisitionInterval(start_s, end_s, source, estimated))
+        found.problems.append(
+            f"{_REFERENCE}: it lies within an acquisition of unknown duration, and the header "
+            "gives no start before it"
+        )
     if found.problems:
         raise ImplausibleTimeError("; ".join(found.problems))
     return None
@@ -89,6 +102,18 @@ class _Instants:
     def of_frame(self, name: str) -> float | None:
         text = self._frame.find("FrameContentSequence", lambda item: item.text(name))
         return self.read(name, text or "")
+
+    def starts(self) -> Iterator[tuple[float, str]]:
+        """(start, source), the most particular one first."""
+        readers: tuple[tuple[str, Callable[[], float | None]], ...] = (
+            (_OF_FRAME, lambda: self.of_frame(_OF_FRAME)),
+            (_OF_ALL, lambda: self.read(_OF_ALL, self._frame.top.text(_OF_ALL))),
+            ("AcquisitionDate+AcquisitionTime", self.date_and_time),
+        )
+        for source, read in readers:
+            start_s = read()
+            if start_s is not None:
+                yield start_s, source
 
     def date_and_time(self) -> float | None:
         top = self._frame.top
@@ -112,26 +137,16 @@ class _Instants:
             return None
 
 
-def _from(
-    start_s: float, duration_s: float | None, source: str, estimated: bool
-) -> AcquisitionInterval:
-    end_s = None if duration_s is None else start_s + duration_s
-    return AcquisitionInterval(start_s, end_s, source, estimated)
+def _around(reference_s: float, started_s: float | None, duration_s: float) -> AcquisitionInterval:
+    """The reference instant lies somewhere in the acquisition: cover all that it may mean.
 
-
-def _around(
-    reference_s: float, acquisition_s: float | None, duration_s: float | None, estimated: bool
-) -> AcquisitionInterval:
-    """The reference instant lies somewhere in the acquisition: cover all that it may mean."""
-    source = "FrameReferenceDateTime"
-    if acquisition_s is None:
-        if duration_s is None:
-            return AcquisitionInterval(reference_s, None, source, estimated)
-        return AcquisitionInterval(
-            reference_s - duration_s, reference_s + duration_s, source, estimated
-        )
-    end_s = None if duration_s is None else max(reference_s, acquisition_s + duration_s)
-    return AcquisitionInterval(min(reference_s, acquisition_s), end_s, source, estimated)
+    A start after it cannot be of the same acquisition.
+    """
+    if started_s is not None and started_s <= reference_s + _ROUNDED_S:
+        start_s = min(reference_s, started_s)
+        return AcquisitionInterval(start_s, max(reference_s, started_s + duration_s), _REFERENCE)
+    end_s = max(reference_s, started_s or reference_s) + duration_s
+    return AcquisitionInterval(reference_s - duration_s, end_s, _REFERENCE)
 
 
 def _duration_s(frame: FrameElements) -> tuple[float | None, bool]:

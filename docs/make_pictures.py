@@ -78,6 +78,7 @@ def take_states(folder: Path) -> None:
         expect(page.locator("#stand")).to_be_visible()
         page.locator("#stand-yt").fill("99")
         taken += take_sizes(page, folder, "positions")
+        arm(client)
         for state in states(page, client):
             taken += take_sizes(page, folder, state)
         room.kill("service")
@@ -85,6 +86,7 @@ def take_states(folder: Path) -> None:
         taken += take_sizes(page, folder, "connection-lost")
     with looking_at_a_room("guide", guide=True) as (page, _, client):
         ask_the_guide(client)
+        expect(page.locator("#confirm")).to_be_enabled()
         taken += take_sizes(page, folder, "guide-confirm")
         confirm_until_ready(client)
         taken += take_sizes(page, folder, "guide-ready")
@@ -106,6 +108,7 @@ def take_sizes(page: Page, folder: Path, state: str) -> int:
 def take_guide(page: Page, client: RoomClient) -> None:
     """Two fiducials and four axes: what is off before a move, and READY."""
     ask_the_guide(client)
+    expect(page.locator("#confirm")).to_be_enabled()
     take(page, "8-guide-confirm")
     confirm_until_ready(client)
     take(page, "8-guide-ready")

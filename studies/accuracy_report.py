@@ -15,6 +15,10 @@ are public. Every figure below was measured by
 
     python -m studies.real_data --data FOLDER --out docs/accuracy.md
 
+What is measured here is the fit of a disc to one slice, which finds the fiducial before there is a
+template and where its centre itself is asked for. Steering goes by the template, the fiducial's own
+image, whose displacements `python benchmarks/template.py` measures on drawn fiducials with truth.
+
 All methods get the same pixels, the same start and the same radius. Ours is the maximum-likelihood
 fit of `sr_engine.locate.refine`: disc with or without a wall, through the likeliest of a short list
 of point spreads, one for each group. The others, at settings of our choosing, are described in

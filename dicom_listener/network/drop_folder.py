@@ -6,8 +6,11 @@ size, for its acquisition had ended by then. The share itself is only read. What
 remembered by its hash, so that a restart takes nothing twice.
 """
 
+import errno
 import io
+import math
 import os
+import stat
 import struct
 import threading
 import time
@@ -22,12 +25,15 @@ import structlog
 from pydicom import dcmread
 from pydicom.dataset import FileDataset
 
-from dicom_listener.inbox import Envelope, Inbox, InboxError, sha256_of
+from dicom_listener.inbox import Envelope, Inbox, sha256_of
 from dicom_slice.quirks import MR_CLASSES
 
 SENDER = "watch_dir"
 _PART10_HEAD = 144  # preamble, DICM, and the element with the length of the meta group
 _UNDEFINED = 0xFFFFFFFF
+# what is seen so long after the look before, or was changed so long ago, may have lain there
+_LOOK_GAP_S = 2.0
+_OLD_S = 300.0
 _UNFINISHED = (".part", ".tmp", ".partial", ".filepart", ".crdownload")
 
 log = structlog.get_logger("listener")
@@ -39,12 +45,16 @@ class NotWholeError(ValueError):
 
 @dataclass(frozen=True)
 class Seen:
-    """A file as it was at one look: it is looked at again until it keeps still."""
+    """A file as it was at one look: it is looked at again until it keeps still.
+
+    is_fresh: it was not there, or not yet like this, at the look just before.
+    """
 
     size_bytes: int
     changed_ns: int
     since_s: float
     since_monotonic_s: float
+    is_fresh: bool
 
 
 class DropFolder:
@@ -71,7 +81,9 @@ class DropFolder:
         self._unfinished_alarm_s = unfinished_alarm_s
         self._seen: dict[str, Seen] = {}
         self._done: dict[str, tuple[int, int]] = {}  # name: size and change of what is dealt with
+        self._troubled: set[str] = set()  # that could not be taken, and were reported
         self._is_there = True
+        self._looked_s = -math.inf  # when the last look began that saw the folder, monotonic
         self._stopped = threading.Event()
         self._thread = threading.Thread(target=self._run, name="watch_dir", daemon=True)
 
@@ -91,6 +103,7 @@ class DropFolder:
 
     def look(self) -> None:
         """One round over the folder: take what is whole, remember what may become so."""
+        began_s = time.monotonic()
         try:
             found = dict(self._files())
         except OSError as error:
@@ -105,9 +118,11 @@ class DropFolder:
         self._is_there = True
         for name in self._seen.keys() - found.keys():
             del self._seen[name]
+            self._troubled.discard(name)
         for name, (size, changed_ns) in found.items():
             if self._done.get(name) != (size, changed_ns):
                 self._consider(name, size, changed_ns)
+        self._looked_s = began_s
 
     def _files(self) -> Iterator[tuple[str, tuple[int, int]]]:
         """(name relative to the folder, (size, time of change)) of all that may be slices."""
@@ -120,14 +135,16 @@ class DropFolder:
                 path = Path(folder) / name
                 try:
                     status = path.stat()
-                except FileNotFoundError:  # renamed in this moment
+                except OSError:  # renamed in this moment, a link to nowhere, or locked
+                    continue
+                if not stat.S_ISREG(status.st_mode):  # reading a pipe would wait for ever
                     continue
                 yield str(path.relative_to(self._folder)), (status.st_size, status.st_mtime_ns)
 
     def _consider(self, name: str, size: int, changed_ns: int) -> None:
         seen = self._seen.get(name)
         if seen is None or (seen.size_bytes, seen.changed_ns) != (size, changed_ns):
-            self._seen[name] = Seen(size, changed_ns, time.time(), time.monotonic())
+            self._seen[name] = self._first_seen(size, changed_ns)
             return
         still_s = time.monotonic() - seen.since_monotonic_s
         if still_s < self._still_s:
@@ -142,15 +159,24 @@ class DropFolder:
                     return
                 text = f"{name}: incomplete for {still_s:.0f} s ({error}); it is not used"
                 self._alarm("watch_dir_refused", text)
-            except OSError as error:
-                self._alarm("watch_dir_refused", f"{name}: {error.strerror or error}")
-                if isinstance(error, InboxError):  # there is no room for it now
-                    return
+            except OSError as error:  # locked by the console, or no room: it may go in a while
+                if name not in self._troubled:
+                    self._troubled.add(name)
+                    text = f"{name}: {error.strerror or error}; it is tried again"
+                    self._alarm("watch_dir_refused", text)
+                return
+        self._troubled.discard(name)
         self._done[name] = size, changed_ns
         del self._seen[name]
 
+    def _first_seen(self, size: int, changed_ns: int) -> Seen:
+        now_s, now_monotonic_s = time.time(), time.monotonic()
+        is_recent = now_s - changed_ns * 1e-9 < _OLD_S
+        is_fresh = is_recent and now_monotonic_s - self._looked_s < _LOOK_GAP_S
+        return Seen(size, changed_ns, now_s, now_monotonic_s, is_fresh)
+
     def _take(self, name: str, seen: Seen) -> None:
-        raw = (self._folder / name).read_bytes()
+        raw = self._read(name)
         data_set, body = whole_file(raw)
         digest = sha256_of(body)
         if digest in self._taken:
@@ -167,12 +193,21 @@ class DropFolder:
             sop_instance_uid=str(data_set.get("SOPInstanceUID", "")),
             sha256=digest,
             size_bytes=len(body),
+            is_fresh=seen.is_fresh,
         )
         path = self._inbox.store(body, envelope)
         self._taken.add(digest)
         with self._taken_file.open("a") as file:
             file.write(digest + "\n")
         self._on_stored(path)
+
+    def _read(self, name: str) -> bytes:
+        """A file that has become a pipe since it was looked at must not keep the thread either."""
+        descriptor = os.open(self._folder / name, os.O_RDONLY | os.O_NONBLOCK)
+        with open(descriptor, "rb") as file:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise OSError(errno.EINVAL, "no regular file")
+            return file.read()
 
     def _alarm(self, kind: str, text: str) -> None:
         self.alarms.append((kind, text))

@@ -115,19 +115,23 @@ class LinkCounters:
     round_trip_s: float | None
 
 
+def _shared(message_kind: type[Any], kind: type[Any]) -> frozenset[str]:
+    """The fields that a message and what the client tells have in common."""
+    return frozenset(one.name for one in fields(message_kind)) & {one.name for one in fields(kind)}
+
+
+_IN_HELLO = _shared(messages.Hello, BridgeIdentity)
+_IN_STATUS = _shared(messages.Status, BridgeStatus)
+
+
 def hello_of(hello: messages.Hello, changed: bool) -> BridgeIdentity:
-    return BridgeIdentity(**_shared(hello, BridgeIdentity), boot_id_changed=changed)
+    said = {name: getattr(hello, name) for name in _IN_HELLO}
+    return BridgeIdentity(**said, boot_id_changed=changed)
 
 
 def status_of(status: messages.Status, age_s: float) -> BridgeStatus:
     state = status.command_state
-    said = _shared(status, BridgeStatus)
+    said = {name: getattr(status, name) for name in _IN_STATUS}
     said["phase"] = WorkPhase(status.phase)
     said["command_state"] = CommandState(state) if state else None
     return BridgeStatus(age_s=age_s, **said)
-
-
-def _shared(message: messages.Message, kind: type[Any]) -> dict[str, Any]:
-    """The fields that a message and what the client tells have in common."""
-    names = {column.name for column in fields(message)} & {column.name for column in fields(kind)}
-    return {name: getattr(message, name) for name in names}

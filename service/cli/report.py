@@ -218,6 +218,9 @@ def _plots(record: CaseRecord) -> Iterable[str]:
     figure, axes = new_figure(8, 3)
     axes.errorbar(numbers, errors, yerr=sigmas, fmt=".", capsize=2)
     axes.set(xlabel="measurement", ylabel="distance to target, mm", yscale="log")
+    axes.xaxis.get_major_locator().set_params(integer=True)
+    for which in (axes.yaxis.set_major_formatter, axes.yaxis.set_minor_formatter):
+        which("{x:.2g}")
     axes.grid(visible=True, which="both", alpha=0.3)
     yield "<h2>Distance to the target</h2>"
     yield image_tag(figure, "distance to the target, measurement by measurement")

@@ -6,8 +6,7 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from dicom_listener.clock import Promptness
-from dicom_listener.promptness import promptness_of
+from dicom_listener.promptness import Promptness, promptness_of
 from service.commissioning.evidence import CommissioningError, ScannedSeries
 
 # A person presses so long before (below 0) or after what is seen or heard to start or to end.

@@ -71,11 +71,10 @@ export class Next {
     this.mayAct = role === "operator";
     this.state = state;
     setText(byId("prompt"), promptOf(state));
-    byId("prompt").classList.toggle("ready", state.ready);
+    byId("prompt").classList.toggle("ready", state.ready && !state.punctured);
     byId("prompt").classList.toggle("long", state.prompt.length > 60);
     drawChips({ linked: state.robot.linked, stopped: state.robot.stopped, armed: state.robot.armed, moving: state.robot.moving, insertion_locked: state.robot.insertion_locked, position_certain: state.robot.position_certain, fault: state.robot.fault });
     setText(byId("prompt-more"), moreOf(state));
-    setText(byId("said"), state.punctured ? words.punctured : "");
     forgetOldRefusal(state);
     this.drawQuestion(state.question, state);
     this.drawActions([role, actionsFor(state).map(keyOf(state.robot)), state.question?.question_id, state.next_action], state);
@@ -113,7 +112,7 @@ export class Next {
   }
 
   drives() {
-    return h("ul", {}, this.state.calibration_drives.map(({ axis, stops_mm: stops }) => h("li", {}, words.drives(axis, stops.map((at) => mm(at, 1)).join(" → ")))));
+    return h("ul", {}, this.state.calibration_drives.map(({ axis, stops_mm: stops }) => h("li", {}, words.drives(axis, stops.map((at) => mm(at, 1)).filter((at, k, all) => at !== all[k - 1]).join(" → ")))));
   }
 
   askDepth() {

@@ -52,14 +52,16 @@ export function distanceFromSlice(geometry, pointMm) {
   return Math.hypot(...pointMm.map((value, k) => value - foot[k]));
 }
 
-// (row, col) mm in the slice -> "0.21 mm to head, 0.05 mm to left"
-export function inWords(geometry, rowMm, colMm, digits = 2) {
-  const part = (value, direction) => {
-    const towards = value >= 0 ? direction : opposite(direction);
-    return `${Math.abs(value).toFixed(digits)} mm to ${side(towards)}`;
-  };
-  return `${part(rowMm, geometry.row_direction)}, ${part(colMm, geometry.col_direction)}`;
-}
+const parts = (geometry, rowMm, colMm, part) => [[rowMm, geometry.row_direction], [colMm, geometry.col_direction]]
+  .map(([value, direction]) => part(Math.abs(value), value >= 0 ? direction : opposite(direction))).join(", ");
+
+// (row, col) mm in the slice -> "0.21 mm toward the head, 0.05 mm toward the left"
+export const inWords = (geometry, rowMm, colMm, digits = 2) =>
+  parts(geometry, rowMm, colMm, (mm, direction) => `${mm.toFixed(digits)} mm toward the ${side(direction)}`);
+
+// the same in short: "H 0.21, L 0.05 mm"
+export const inLetters = (geometry, rowMm, colMm, digits) =>
+  `${parts(geometry, rowMm, colMm, (mm, direction) => `${letter(direction)} ${mm.toFixed(digits)}`)} mm`;
 
 // Half-axes (mm) and direction (degrees, from growing columns to growing rows) of a covariance.
 export function ellipse([[rr, rc], [, cc]], sigmas) {

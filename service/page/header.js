@@ -7,6 +7,16 @@ import { TEXTS } from "./texts.js";
 const PHASES = ["START_UP", "CALIBRATION", "PLANNING", "TARGETING", "MOVE_TO_TARGET", "MANUAL"];
 const ALARM_PHASES = ["STOP", "EMERGENCY"];
 
+// What the case is at. The bridge changes its phase with a motion and not before, so that while nothing
+// moves its word is of the past: then what runs, or what is to be done next, says it. STOP is its own.
+const OF_NEXT = { calibration: "CALIBRATION", target: "PLANNING", entry: "PLANNING", approach: "TARGETING", puncture: "MOVE_TO_TARGET", "needle-out": "MOVE_TO_TARGET" };
+
+export function phaseOf({ robot, procedure, next_action: next }) {
+  if (ALARM_PHASES.includes(robot.phase) || robot.moving) return robot.phase;
+  if (procedure) return procedure.includes("calibration") ? "CALIBRATION" : procedure === "jog" ? "MANUAL" : "MOVE_TO_TARGET";
+  return OF_NEXT[next] ?? "START_UP";
+}
+
 const phase = (name) => TEXTS.phases[name] ?? plain(name);
 
 export const drawPhases = whenChanged(({ phase: now }) => {
@@ -34,12 +44,12 @@ export const drawLights = whenChanged(({ page, robot, processes }) => {
 });
 
 export function drawHead(state, connected) {
-  drawPhases({ phase: state.robot.phase });
+  drawPhases({ phase: phaseOf(state) });
   drawLights({ page: connected, robot: { linked: state.robot.linked, boot_id: state.robot.boot_id, problem: state.robot.problem }, processes: state.processes });
   setText(byId("room"), state.case?.label ? `${state.room} · ${state.case.label}` : state.room);
   setHidden(byId("banner-virtual"), !state.virtual);
   drawEmergency(state.robot.linked && state.robot.phase === "EMERGENCY");
-  document.title = `${state.ready ? "READY" : phase(state.robot.phase)} · ${TEXTS.title}`;
+  document.title = `${state.ready ? "READY" : phase(phaseOf(state))} · ${TEXTS.title}`;
 }
 
 function drawEmergency(isOn) {

@@ -19,11 +19,17 @@ function oneValue(value) {
   return String(value);
 }
 
+// error_mm, 0.026 -> "error 0.026 mm"
+function withUnit(name, text) {
+  const [, what, unit] = name.match(/^(.*?)(?:_(um|mm|s))?$/);
+  return `${what.replaceAll("_", " ")} ${text}${unit ? ` ${unit.replace("um", "µm")}` : ""}`;
+}
+
 // The body of an event, short: what a person wants to know at a glance.
 function inWords(body) {
   return Object.entries(body)
     .filter(([name, value]) => !UNSAID.has(name) && value !== null && value !== "")
-    .map(([name, value]) => (typeof value === "string" ? value : `${name.replace(/_(um|mm|s)$/, "").replaceAll("_", " ")} ${oneValue(value)}`))
+    .map(([name, value]) => (typeof value === "string" ? value : withUnit(name, oneValue(value))))
     .join(", ").slice(0, 160);
 }
 

@@ -1,7 +1,7 @@
 // Logging in with a token, where the room asks for one.
 
 import { get, order, useCsrf } from "./api.js";
-import { byId, h, replace } from "./dom.js";
+import { byId, h, replace, setText } from "./dom.js";
 import { TEXTS } from "./texts.js";
 
 const { login: words } = TEXTS;
@@ -33,6 +33,7 @@ export function askForToken(onDone) {
   }, h("h2", { id: "h-login" }, words.heading), h("label", { htmlFor: "token" }, words.token), token,
   refusal, h("button", { class: "main" }, words.button));
   replace(dialog, form);
+  setText(byId("prompt"), words.heading);
   dialog.addEventListener("cancel", (event) => event.preventDefault());
   dialog.showModal();
 }

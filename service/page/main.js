@@ -7,7 +7,7 @@ import { drawBelief } from "./belief.js";
 import { byId, setHidden, setText, whenChanged } from "./dom.js";
 import { drawCaseDesk, drawHolding } from "./case_desk.js";
 import { drawNumbers } from "./distance.js";
-import { drawHead, drawLights, showLost, showUp, startHeader } from "./header.js";
+import { drawHead, drawLights, phaseOf, showLost, showUp, startHeader } from "./header.js";
 import { drawHistory } from "./history_plot.js";
 import { guard } from "./guard.js";
 import { Images } from "./images.js";
@@ -57,13 +57,13 @@ function draw(state) {
   drawCaseDesk({ ...desk, begins: state.cases_begin_here, asks: Boolean(state.case_question) });
   drawHolding({ ...desk, holding: state.holding });
   drawScannerClock({ clock: state.clock, clock_implies: state.clock_implies, role: page.role });
-  drawParts({ robot: { linked: robot.linked, boot_id: robot.boot_id, problem: robot.problem }, processes: state.processes, slices: state.slices });
+  drawParts({ robot: { linked: robot.linked, boot_id: robot.boot_id, phase: robot.phase, problem: robot.problem }, processes: state.processes, slices: state.slices });
   if (belief) drawBelief({ ...belief, settings: page.role === "operator" ? belief.settings : null });
   newAside([state.slices.quarantined, state.hold?.hold_id, page.role]);
   newTargets([state.target_patient_mm, state.procedure, page.role]);
   newPast([state.procedure, state.punctured, state.case]);
   newMeasurements([state.measurement?.measurement_id, state.measurement?.state, state.target_patient_mm]);
-  sayPhase(robot.phase);
+  sayPhase(phaseOf(state));
 }
 
 // A screen reader hears the phase when it changes (prompt and alarms are live regions of their own).

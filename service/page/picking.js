@@ -42,7 +42,7 @@ export class Picking {
     const start = seen ? this.onSlice(seen) : patientFromPixel(this.view.geometry, [shape[0] / 2, shape[1] / 2]);
     this.build();
     this.moveTo(start);
-    this.view.root.focus();
+    this.view.root.focus({ preventScroll: true });
   }
 
   // The foot of a point on the slice that is shown: what is picked lies in that slice.

@@ -2,18 +2,18 @@
 
 import { h, s } from "./dom.js";
 import { mm, signedMm } from "./format.js";
-import { inWords } from "./geometry.js";
+import { inLetters, inWords } from "./geometry.js";
 import { arrow } from "./overlay.js";
 import { TEXTS } from "./texts.js";
 
 const { plan: words } = TEXTS;
 
-const inSlice = (slice, row, col) => (slice ? inWords(slice, row, col, 3) : `${words.row} ${signedMm(row)}, ${words.col} ${signedMm(col)} mm`);
+const inSlice = (slice, row, col, how = inWords) => (slice ? how(slice, row, col, 3) : `${words.row} ${signedMm(row)}, ${words.col} ${signedMm(col)} mm`);
 
 // With four axes: the distance that is left, of each fiducial and of the tip, before the move.
 function partsOf(plan, slice) {
   const rows = plan.parts.map((part) => h("tr", { "data-part": part.name },
-    h("th", { scope: "row" }, words.parts[part.name] ?? part.name, h("br", {}), inSlice(slice, part.row_mm, part.col_mm)),
+    h("th", { scope: "row" }, words.parts[part.name] ?? part.name, h("br", {}), inSlice(slice, part.row_mm, part.col_mm, inLetters)),
     h("td", {}, h("b", {}, `${mm(Math.hypot(part.row_mm, part.col_mm), 3)} mm`), h("br", {}), `± ${mm(part.sigma_mm, 3)}`)));
   return h("table", { class: "plan-parts" }, h("caption", { class: "quiet" }, words.distance), h("tbody", {}, rows));
 }

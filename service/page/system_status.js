@@ -16,7 +16,7 @@ const counter = (name, metric) => h("tr", {}, h("th", { scope: "row" }, name), h
 export const drawParts = whenChanged(({ robot, processes, slices }) => {
   const rows = [
     row(words.service, TEXTS.conditions.up),
-    row(words.robot, robot.linked ? words.linked(robot.boot_id.slice(0, 8)) : robot.problem, robot.linked ? "" : "wrong"),
+    row(words.robot, robot.linked ? words.linked(robot.boot_id.slice(0, 8), TEXTS.phases[robot.phase] ?? robot.phase) : robot.problem, robot.linked ? "" : "wrong"),
     ...processes.map((one) => row(plain(one.name), TEXTS.conditions[one.condition], one.condition === "up" ? "" : "wrong")),
     row(words.slices, Object.entries(slices).map(([name, count]) => `${count} ${words.states[name] ?? name}`).join(", ") || words.none),
     ...Object.entries(words.counters).map(([metric, name]) => counter(name, metric)),

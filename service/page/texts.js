@@ -30,13 +30,13 @@ export const TEXTS = {
     viewersOnly: "Viewers can look and press STOP only.",
     running: (name) => `Running: ${name}.`,
     last: (text) => `Last: ${text}.`,
-    hold: (hold, place, of, wanted) => `Robot position ${of > 1 ? `${place} of ${of} of this shift set (hold ${hold})` : `hold ${hold}`}. ${many(wanted, "more slice")} needed here.`,
+    hold: (hold, place, of, wanted) => `${of > 1 ? `Position ${place} of ${of} of the shift set (hold ${hold})` : `Hold ${hold}`}: ${many(wanted, "more slice")} needed.`,
     confirm: (mm) => `Confirm the move of ${mm} mm?`,
     confirmButton: "CONFIRM MOVE", rejectButton: "Reject", cancel: "Cancel",
     arm: "Arm the robot", rearm: "Re-arm the robot",
     needleOut: "Needle withdrawn – unlock motion",
-    puncture: "Record the puncture", depth: "Insertion depth, mm (optional)", punctured: "Puncture recorded.",
-    approach: "Start the approach", pick: "Pick the target on the slice", calibrate: "Start the calibration", targetHere: "Set the target to where the fiducial is now",
+    puncture: "Record the puncture", depth: "Insertion depth, mm (optional)",
+    approach: "Start the approach", pick: "Pick the target on the slice", calibrate: "Start the calibration", targetHere: "Set the target at the fiducial",
     acquired: (hold) => `Slices for hold ${hold} acquired`,
     abort: "End the procedure",
     needleOutSure: "Yes, the needle is out of the patient – unlock",
@@ -47,9 +47,10 @@ export const TEXTS = {
   },
   stand: {
     heading: "Assumed stage positions", from: (source) => `From: ${source}. Read each stage's scale and correct what differs.`,
-    field: (axis) => `Position of ${axis}, mm`, unit: "mm", assumed: (mm) => `mm (assumed: ${mm})`,
+    field: (axis) => `Position of ${axis}, mm`, unit: "mm", assumed: (mm) => `mm, assumed ${mm}`,
     notNumber: "type a position in mm.", outside: (low, high) => `outside its travel, ${low} to ${high} mm.`,
-    confirm: (arm) => `Positions are right: ${arm.toLowerCase()}`,
+    // a button does not break at this hyphen
+    confirm: (arm) => `Positions are right: ${arm.toLowerCase().replace("-", "\u2011")}`,
   },
   chips: {
     stopped: "Stopped", armed: "Armed", notArmed: "Not armed", moving: "Moving", still: "Standing still",
@@ -67,7 +68,7 @@ export const TEXTS = {
     noFiducial: (why) => `No fiducial found: ${why}`, atReady: "Known when the next move is planned, and at READY.", nothing: "No target or no measurement yet.",
     lies: (where) => `The target lies ${where}.`, liesByNewest: (where) => `By the newest slices alone the target lies ${where}.`,
     within: (mm) => `Probability within ${mm} mm`, withinTitle: "that the true distance is below the tolerance",
-    measured: (age, left) => `Measured ${age} ago${left}.`, goodFor: (left) => `, good for ${left} more`,
+    measured: (age, left) => `Measured ${age} ago${left}.`, goodFor: (left) => `, valid for another ${left}`,
     tipBelow: "Tip below lower joint", slices: "Slices", snr: "Signal to noise", chi2: "χ² per degree of freedom", method: "Method",
   },
   needle: {
@@ -163,7 +164,7 @@ export const TEXTS = {
     forgetTitle: "Slices stay pending until the clocks are compared again.", why: "said on the page",
   },
   system: {
-    heading: "System", service: "Service", robot: "Robot", slices: "Slices", none: "none", linked: (boot) => `linked, session ${boot}`,
+    heading: "System", service: "Service", robot: "Robot", slices: "Slices", none: "none", linked: (boot, phase) => `linked, session ${boot}, in phase ${phase}`,
     counters: { autospine_link_frames_sent: "Frames sent to the robot", autospine_link_frames_resent: "Frames sent again", autospine_link_frames_bad: "Frames received damaged", autospine_viewers: "Screens open" },
     roundTrip: "Round trip to the robot", states: { assigned: "used", quarantined: "set aside", pending: "pending" },
   },

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from robot_bridge.protocol.phases import WorkPhase
 from service.procedure.estimate import FiducialEstimate, MotionNoise
 from service.procedure.fiducials import ONE_FIDUCIAL, Geometry
 from service.procedure.jacobian import CalibrationError, ImageJacobian
@@ -153,7 +154,8 @@ def calibrate(arguments: CalibrationArguments) -> ProcedureSteps[Calibration]:
         last = number == len(places)
         if last:
             _check(arguments, learnt)
-        moved = yield from move(MoveTo(setpoints_um, f"calibration {number}/{len(places)}"))
+        purpose = f"calibration {number}/{len(places)}"
+        moved = yield from move(MoveTo(setpoints_um, purpose, phase=WorkPhase.CALIBRATION))
         predicted = stops[-1].moved_to(moved.readback_um, learnt, gate.noise) if last else None
         looks.append((yield from _look(arguments, stops, predicted)))
         _check_plane(looks)

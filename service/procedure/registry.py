@@ -8,6 +8,7 @@ from typing import Any
 
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Procedure
+from robot_bridge.protocol.phases import WorkPhase
 from service.procedure.aim import ApproachArguments
 from service.procedure.approach import Arrival, approach
 from service.procedure.calibration import Calibration, CalibrationArguments, calibrate
@@ -25,7 +26,7 @@ RECORDING = "recording"
 GUIDE_CALIBRATION = "guide_calibration"
 GUIDE_APPROACH = "guide_approach"
 GUIDE_RECORDING = "guide_recording"
-JOG, JOG_PURPOSE = "jog", "manual"
+JOG = "jog"
 CALIBRATIONS, APPROACHES = (CALIBRATION, GUIDE_CALIBRATION), (APPROACH, GUIDE_APPROACH)
 
 Arguments = CalibrationArguments | ApproachArguments | RecordingArguments
@@ -43,7 +44,7 @@ class JogEnd:
 
 def jog(setpoints_um: Mapping[str, int]) -> ProcedureSteps[JogEnd]:
     """Go to the setpoints; raises ProcedureFailedError if the bridge refuses."""
-    moved = yield from move(MoveTo(dict(setpoints_um), JOG_PURPOSE))
+    moved = yield from move(MoveTo(dict(setpoints_um), "manual", phase=WorkPhase.MANUAL))
     return JogEnd(moved.readback_um)
 
 

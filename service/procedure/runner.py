@@ -15,6 +15,7 @@ from typing import TypeVar
 from case_record.record import CaseRecord
 from case_record.rows import Step as RecordedStep
 from service.procedure.steps import (
+    MoveTo,
     Outcome,
     ProcedureSteps,
     Step,
@@ -67,6 +68,8 @@ def same_step(known: RecordedStep, step: Step) -> bool:
     """True if the recorded step is this one; what a program before did not know has its default."""
     kind, body = step_to_json(step)
     defaults = {one.name: one.default for one in fields(step) if one.default is not MISSING}
+    if isinstance(step, MoveTo):  # a program before took the phase from the purpose
+        defaults["phase"] = step.phase
     recorded = json.loads(json.dumps({**defaults, **known.body}))
     return known.kind == kind and recorded == json.loads(json.dumps(body))
 

@@ -11,6 +11,8 @@ from collections.abc import Generator, Mapping
 from dataclasses import asdict, dataclass, field
 from typing import Any, TypeVar
 
+from robot_bridge.protocol.phases import WorkPhase
+
 
 @dataclass(frozen=True)
 class MoveTo:
@@ -18,7 +20,8 @@ class MoveTo:
 
     shift_px is the displacement of the fiducial (row, col) that this place has from the reference
     of its shift set; rests_on names the measurement that the plan was made from, from_um where the
-    robot stood then: elsewhere, or after a newer measurement, the plan is void.
+    robot stood then: elsewhere, or after a newer measurement, the plan is void. purpose is for
+    people; phase: the work phase in which the bridge makes the move.
     """
 
     setpoints_um: Mapping[str, int]
@@ -29,6 +32,7 @@ class MoveTo:
     shift_px: tuple[float, float] = (0.0, 0.0)
     shift_um: Mapping[str, int] = field(default_factory=dict)
     from_um: Mapping[str, int] | None = None
+    phase: WorkPhase = WorkPhase.MOVE_TO_TARGET
 
 
 @dataclass(frozen=True)

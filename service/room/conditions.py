@@ -55,7 +55,14 @@ def conditions(state: RoomState) -> list[Condition]:
         found.append(Condition("stopped", "alarm", text, "Re-arm when it is safe."))
     if robot.linked and not robot.position_certain:
         text = "The robot's position is uncertain"
-        found.append(Condition("position", "warning", text, "Re-arm, then measure."))
+        found.append(
+            Condition(
+                "position",
+                "warning",
+                text,
+                "Confirm where the stages stand, then measure.",
+            )
+        )
     if state.ready_lost is not None:
         text = f"READY was lost: {state.ready_lost.text}"
         what = (

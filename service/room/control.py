@@ -38,11 +38,12 @@ from service.room.cases.between import BetweenCases
 from service.room.cases.life import CaseLife, is_finished, set_at_rest
 from service.room.commands.commands import Commands
 from service.room.conditions import conditions
-from service.room.context import RoomContext
+from service.room.context import RoomContext, now_of
 from service.room.counts.correct import correct_counts
 from service.room.execution import Execution, ProcedureAbortedError
 from service.room.integrity import doubt_of, doubt_of_arrival
 from service.room.link import RoomLink
+from service.room.present import Now
 from service.room.readiness import ConflictError
 from service.room.scanner_clock import ClockWatch, note_step
 from service.room.state import RoomState
@@ -50,7 +51,7 @@ from service.room.state_view import Describer, ProcessLook, describe_robot
 from service.room.stop_latch import StopLatch
 from service.room.trouble import RECORD_FAULTS, Trouble, held
 
-_TICK_S = 0.002
+_TICK_S = 0.01
 _HOLD_TICK_S = 0.02
 _TRIED_AGAIN_S = 0.5
 _SAID_AGAIN_S = 60.0
@@ -140,6 +141,11 @@ class ControlLoop:
     def state(self) -> RoomState:
         """The newest published state; safe to read from any thread."""
         return self._state
+
+    @property
+    def now(self) -> Now:
+        """How things stand beside the record; safe to read from any thread."""
+        return now_of(self._config, self._link)
 
     @property
     def state_age_s(self) -> float:

@@ -40,12 +40,6 @@ _SERVICE = "service"
 _STOPPED_BY_PEOPLE = frozenset({Code.OPERATOR_STOP.value, Code.EMERGENCY_STOP.value})
 
 
-def _phase_of(purpose: str) -> WorkPhase:
-    if "calib" in purpose:
-        return WorkPhase.CALIBRATION
-    return WorkPhase.MANUAL if purpose == "manual" else WorkPhase.MOVE_TO_TARGET
-
-
 def _stands_at(hold: Hold, status: BridgeStatus) -> bool:
     """Whether the robot has stood at the hold ever since it began."""
     undisturbed = bool(hold.bridge) and why_stood_no_more(hold.bridge, status) is None
@@ -133,7 +127,6 @@ class Execution:
     # Moves
 
     def _move(self, step: MoveTo, command_id: str) -> Moved:
-        phase = _phase_of(step.purpose)
         case_uid = command_id.split("/")[0]
         measurement = None
         if step.rests_on is not None:
@@ -158,8 +151,8 @@ class Execution:
                 )
             self.prompt = f"The robot is moving ({step.purpose})."
             try:
-                if not self._stands_in_motion_phase(phase):
-                    self._link.enter_phase(phase, _SERVICE)
+                if not self._stands_in_motion_phase(step.phase):
+                    self._link.enter_phase(step.phase, _SERVICE)
                 outcome = self._link.client.move(
                     command_id,
                     step.setpoints_um,

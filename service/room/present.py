@@ -23,6 +23,7 @@ from typing import Any
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Event, Measurement
 from robot_bridge.client.client import BridgeStatus
+from service.procedure.initial_estimate import POSITION_DECLARED
 from service.procedure.plan import SAME_PLACE_UM
 from service.procedure.scan_frame import (
     CASE_REOPENED,
@@ -126,6 +127,24 @@ def why_not_now(record: CaseRecord, measurement: Measurement, now: Now) -> Lost 
     return (
         _case_ended(record, measurement)
         or _robot_changed(facts, now)
+        or _scanner_changed(record, measurement)
+        or _too_old(facts, now)
+        or _measured_again(record, measurement)
+    )
+
+
+def why_not_carried(record: CaseRecord, measurement: Measurement, now: Now) -> Lost | None:
+    """Return why the fiducial is not where the robot's moves since a finished measurement have
+    carried it, or None: as `why_not_now`, but for the moves that this case ordered.
+    """
+    if record.doubt:
+        return Lost("record_changed", record.doubt)
+    facts = measurement.request.get(RESTS_ON)
+    if facts is None:
+        return Lost("unknown", "it is unknown what the measurement relies on")
+    return (
+        _case_ended(record, measurement)
+        or _moved_otherwise(record, measurement, facts, now)
         or _scanner_changed(record, measurement)
         or _too_old(facts, now)
         or _measured_again(record, measurement)
@@ -250,6 +269,26 @@ def _moved(facts: Mapping[str, Any], status: BridgeStatus) -> Lost | None:
         what = status.last_motion.partition(":")[0]
         return _MOTIONS.get(what, Lost("moved", "measured before the last move"))
     return Lost("moving", "the robot is moving") if status.moving else None
+
+
+def _moved_otherwise(
+    record: CaseRecord, measurement: Measurement, facts: Mapping[str, Any], now: Now
+) -> Lost | None:
+    """What happened to the robot since besides moves of this case."""
+    status = now.status
+    declared = record.last_event(POSITION_DECLARED)
+    if declared is not None and declared.seq > measurement.requested_seq:
+        return _MOTIONS["declared"]
+    if status is None or not record.has_move(status.last_motion):
+        return _robot_changed(facts, now)
+    if facts["boot_id"] != status.boot_id:
+        return _moved(facts, status)
+    there = {**facts, "positions_um": record.move(status.last_motion).setpoints_um}
+    return (
+        _stopped(facts, status)
+        or _disturbed(facts, status)
+        or (None if status.moving else _elsewhere(there, status))
+    )
 
 
 def _stopped(facts: Mapping[str, Any], status: BridgeStatus) -> Lost | None:

@@ -1,7 +1,8 @@
 """What planning stations propose: targets and entry points that nobody has taken over yet.
 
 A proposal is an event; that it was taken over or refused is another. Nothing in it changes the
-target before the operator says so, and of one sender only the newest is open.
+target before the operator says so, and of one sender only the newest is open. It is meant for the
+table as it lies: when that may have moved, it is withdrawn.
 """
 
 from __future__ import annotations
@@ -15,8 +16,11 @@ from pydantic import BaseModel, ConfigDict
 
 from case_record.record import CaseRecord
 from case_record.rows import Event
+from service.procedure.scan_frame import ScanFrame, calibration_good_since, other_place_since
 
 PROPOSED, TAKEN, REFUSED = "plan_proposed", "proposal_taken", "proposal_refused"
+WITHDRAWN = "proposal_withdrawn"
+SCAN_FRAME = "scan_frame"
 MOST_OPEN = 8
 _MOST_SHOWN = 24
 _BORE_MM = 500.0
@@ -25,7 +29,9 @@ Point3 = tuple[float, float, float]
 
 
 class ProposalState(BaseModel):
-    """Patient LPS mm. state: open, taken, refused (with the reason), or replaced by a newer one."""
+    """Patient LPS mm. state: open, taken, refused (with the reason), replaced by a newer one, or
+    withdrawn because the table may have moved.
+    """
 
     model_config = ConfigDict(frozen=True)
 
@@ -63,12 +69,13 @@ class Plan:
 
 @dataclass(frozen=True)
 class Verdict:
-    """code: `proposed` (its number is given), `invalid`, `out_of_reach` or `too_many`."""
+    """code: `proposed` (with its number in the case), `invalid`, `out_of_reach` or `too_many`."""
 
     code: str
     text: str
     number: int | None = None
     reach_known: bool = False
+    case_uid: str = ""
 
 
 def why_senseless(plan: Plan) -> str:
@@ -102,6 +109,20 @@ def frame_of_reference(record: CaseRecord) -> str:
     """Of the newest slice that was used; empty where there is none yet."""
     row = record.last_slice("assigned") or record.last_slice()
     return "" if row is None else str(row.header.get("frame_of_reference_uid") or "")
+
+
+def why_void(record: CaseRecord, proposed: Event) -> str:
+    """Why the place that was proposed is not where it was meant any more; empty if nothing says so.
+
+    Whether the sender says its frame of reference or not: it saw the slices of its time.
+    """
+    if proposed.seq <= calibration_good_since(record):
+        return "the table may have moved since, or the case was opened again; plan it again"
+    frame = ScanFrame(**proposed.body.get(SCAN_FRAME, {}))
+    other = other_place_since(record, proposed.seq, frame)
+    if not other:
+        return ""
+    return f"slices from {other} have since arrived and the table may have moved; plan it again"
 
 
 class ProposalBook:
@@ -139,7 +160,7 @@ class ProposalBook:
                 number=event.event_id, at_s=event.wall_s, **body
             )
         elif body.get("proposal") in self._known:
-            state = "taken" if event.kind == TAKEN else "refused"
+            state = event.kind.removeprefix("proposal_")
             change = {"state": state, "by": event.who, "reason": body.get("why", "")}
             self._close(int(body["proposal"]), change)
 
@@ -149,6 +170,8 @@ class ProposalBook:
 
 def _events(record: CaseRecord, after_id: int) -> list[Event]:
     found = [
-        e for kind in (PROPOSED, TAKEN, REFUSED) for e in record.events_of_kind(kind, after_id)
+        e
+        for kind in (PROPOSED, TAKEN, REFUSED, WITHDRAWN)
+        for e in record.events_of_kind(kind, after_id)
     ]
     return sorted(found, key=lambda event: event.event_id)

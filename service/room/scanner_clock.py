@@ -84,7 +84,7 @@ def _from_event(compared: Event) -> ClockState:
     return ClockState(
         offset_s=compared.body["offset_s"],
         uncertainty_s=compared.body["uncertainty_s"],
-        compared_s=compared.wall_s,
+        compared_s=compared.body["at_s"],
         who=compared.who,
     )
 

@@ -39,11 +39,11 @@ from service.slicer.reading import (
     points_of,
     string_of,
 )
+from service.slicer.reading import stop_word as stop_word
 from service.slicer.scene import axes_along, code_of, status_of
 
 Array = NDArray[np.float64]
 OPENIGTLINK = "OpenIGTLink"
-STOPS = ("STOP", "EMERGENCY")
 INVALID, OUT_OF_REACH = 1, 3
 _PHASES = ("START_UP", "PLANNING", "CALIBRATION", "TARGETING")
 _STATUS_QUERIES, _POSE_QUERIES = (
@@ -62,15 +62,6 @@ class Answer:
     replies: tuple[Message, ...] = ()
     plan: Plan | None = None
     registration: list[list[float]] | None = None
-
-
-def stop_word(message: Received) -> str:
-    """STOP or EMERGENCY if the message says so, however it is addressed; else nothing."""
-    try:
-        text = _text_of(message).upper()
-    except MessageError:
-        return ""
-    return text if text in STOPS else ""
 
 
 def acknowledge(message: Received, state: RoomState) -> Message:
@@ -242,15 +233,6 @@ def _labelled(found: list[ReceivedPoint], label: str) -> tuple[float, float, flo
 # Pieces
 
 _NO_SUCH = "not available here: only STOP, EMERGENCY, queries and proposals are"
-
-
-def _text_of(message: Received) -> str:
-    if message.kind == "STRING":
-        return string_of(message)
-    if message.kind == "COMMAND" and len(message.content) >= COMMAND_HEAD.size:
-        _, name, _, _ = COMMAND_HEAD.unpack_from(message.content)
-        return str(name.split(b"\0", 1)[0].decode("ascii", "replace").strip())
-    return ""
 
 
 def _command_answer(message: Received, error: str, at_s: float) -> Message:

@@ -14,19 +14,12 @@ from typing import Any, Protocol
 
 import structlog
 
-from service.room.proposals import Plan, ProposalState, Verdict
+from service.room.proposals import Plan, Verdict
 from service.room.state import RoomState
-from service.slicer.answers import (
-    Answer,
-    acknowledge,
-    answer,
-    decision_of,
-    stop_word,
-    verdict_of,
-)
+from service.slicer.answers import Answer, acknowledge, answer, decision_of, verdict_of
 from service.slicer.messages import STATUS_NOT_READY, Message, status
 from service.slicer.pose import Pose
-from service.slicer.reading import Received, Stream
+from service.slicer.reading import Received, Stream, stop_word
 from service.slicer.scene import Scene, status_of
 
 _PATIENCE_S = 5.0
@@ -85,7 +78,7 @@ class Peer:
         self._replies: deque[Message] = deque(maxlen=_MOST_REPLIES)
         self._wake = asyncio.Event()
         self._sent: Scene = {}
-        self._mine: set[int] = set()
+        self._mine: dict[tuple[str, int], bool] = {}  # whether the room has shown its case
         self._stopped_at_s = -1e9
         self._allowance, self._allowance_at_s = _PROPOSALS_AT_ONCE, time.monotonic()
         self._telling: set[asyncio.Task[None]] = set()
@@ -110,18 +103,30 @@ class Peer:
                 if isinstance(reason, Exception) and not isinstance(reason, OSError):
                     log.error("peer disconnected", peer=self.name, exc_info=reason)
 
-    def look(self, proposals: list[ProposalState]) -> None:
-        """There is a new scene; say what became of this peer's proposals."""
-        for one in proposals:
-            if one.number in self._mine and one.state != "open":
-                self._mine.discard(one.number)
-                said = decision_of(one.number, one.state, one.by, one.reason, time.time())
-                self._replies.append(said)
+    def look(self, state: RoomState) -> None:
+        """There is a new scene; say what became of this peer's proposals. Their numbers begin anew
+        in each case.
+        """
+        for one in state.proposals:
+            mine = (state.case_uid, one.number)
+            if mine in self._mine and one.state != "open":
+                del self._mine[mine]
+                self._decided(one.number, one.state, one.by, one.reason)
+        for (case_uid, number), was_shown in list(self._mine.items()):
+            if case_uid == state.case_uid:
+                self._mine[case_uid, number] = True
+            elif was_shown:
+                del self._mine[case_uid, number]
+                self._decided(number, "withdrawn", "", "its case has ended")
         self._wake.set()
+
+    def _decided(self, number: int, state_word: str, by: str, reason: str) -> None:
+        self._replies.append(decision_of(number, state_word, by, reason, time.time()))
 
     # What it says
 
     async def _read(self) -> None:
+        front, since_s = -1, 0.0
         while True:
             patience_s = _HALF_A_MESSAGE_S if self._stream.is_waiting else None
             try:
@@ -132,6 +137,12 @@ class Peer:
                 if not data:
                     return
                 messages = self._stream.feed(data)
+            now_s = time.monotonic()
+            if self._stream.front != front:
+                front, since_s = self._stream.front, now_s
+            elif self._stream.is_waiting and now_s - since_s > _HALF_A_MESSAGE_S:
+                messages += self._stream.resume()
+                since_s = now_s
             for message in messages:
                 self._note_version(message.version)
                 word = stop_word(message)
@@ -214,9 +225,9 @@ class Peer:
         else:
             verdict = await self._ask("propose", {"plan": plan})
         if verdict.number is not None:
-            self._mine.add(verdict.number)
+            self._mine[verdict.case_uid, verdict.number] = False
         self._reply(*verdict_of(plan, verdict, self._room.state))
-        self.look(self._room.state.proposals)  # it may have been decided by now
+        self.look(self._room.state)  # it may have been decided by now
 
     def _may_propose(self) -> bool:
         now_s = time.monotonic()

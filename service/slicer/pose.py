@@ -12,13 +12,13 @@ from room_config.load import Config
 from service.procedure.arguments import gate_of, geometry_of
 from service.procedure.fiducials import GuideSeenWrongError, line_of_state
 from service.procedure.registry import latest_calibration
+from service.room.present import Now, why_not_carried, why_not_now
 from service.room.state import ArrivalState, RoomState
 from service.slicer.messages import INVALID, TRANSFORM_STATUS, VALID, Message, transform
 from service.slicer.scene import axes_along, standing
 
 Array = NDArray[np.float64]
 CURRENT_POSITION = "CURRENT_POSITION"
-_ONLY_MOVED = ("moved", "moving")
 _RAS_AXES = np.diag([-1.0, -1.0, 1.0])
 
 
@@ -53,8 +53,11 @@ def pose_message(pose: Pose | None, at_s: float) -> Message:
     return pose.message(CURRENT_POSITION, at_s)
 
 
-def pose_of(state: RoomState, record: CaseRecord | None, config: Config) -> Pose | None:
+def pose_of(
+    state: RoomState, record: CaseRecord | None, config: Config, present: Now
+) -> Pose | None:
     """None where nobody knows: not calibrated, or more than a move has happened since it was seen.
+    present: how things stand beside the record.
 
     With two fiducials the origin is the lower ball joint, at READY the needle's tip; with one it is
     the fiducial, and the axes are the patient's: one point has no direction.
@@ -66,12 +69,9 @@ def pose_of(state: RoomState, record: CaseRecord | None, config: Config) -> Pose
     if seen is not None and config.service.guide is None:
         sigma_mm = float(np.sqrt(np.trace(np.array(seen.covariance_mm2 or np.zeros((2, 2)))) / 2))
         return Pose(_RAS_AXES, np.array(seen.patient_mm), "fiducial", sigma_mm, True)
-    last = state.measurement
-    if record is None or last is None or not state.robot.linked:
+    if record is None or not state.robot.linked:
         return None
-    if last.lost is not None and last.lost.code not in _ONLY_MOVED:
-        return None
-    return _carried(state, record, config)
+    return _carried(state, record, config, present)
 
 
 def _arrived(arrival: ArrivalState) -> Pose:
@@ -80,19 +80,23 @@ def _arrived(arrival: ArrivalState) -> Pose:
     return Pose(axes_along(along), tip, "needle tip", arrival.sigma_mm, True)
 
 
-def _carried(state: RoomState, record: CaseRecord, config: Config) -> Pose | None:
+def _carried(state: RoomState, record: CaseRecord, config: Config, present: Now) -> Pose | None:
     guide = config.service.guide
     known = latest_calibration(record, guide=guide is not None)
-    if known is None:
+    if known is None or present.status is None:
         return None
-    here = dict(state.robot.positions_um)
-    if not set(known.jacobian.axes) <= set(here):
+    here = dict(present.status.positions_um)
+    measurement, newest = record.measurement(known.measurement_id), record.last_measurement("done")
+    is_newest = newest is not None and newest.measurement_id == known.measurement_id
+    if not (is_newest or state.procedure) or not set(known.jacobian.axes) <= set(here):
+        return None  # it was looked again since, and no procedure says what that means
+    if why_not_carried(record, measurement, present) is not None:
         return None
     estimate = known.estimate.moved_to(here, known.jacobian, gate_of(config).noise)
-    measured = dict(known.estimate.setpoints_um) == here
+    measured = why_not_now(record, measurement, present) is None
     sigma_mm = float(np.sqrt(np.trace(estimate.covariance_mm2) / len(estimate.plane_mm)))
     if guide is None:
-        seen = record.measurement(known.measurement_id).result or {}
+        seen = measurement.result or {}
         depth = float(known.plane.normal @ np.array(seen["patient_mm"])) * known.plane.normal
         place = known.plane.direction(estimate.plane_mm) + depth
         return Pose(_RAS_AXES, place, "fiducial", sigma_mm, measured)

@@ -2,7 +2,8 @@
 
 What peers send is not trusted: a message whose CRC is wrong, whose version is not 1 or 2, or whose
 body is over the limit is counted and passed over, and reading goes on at the next thing that looks
-like a header. A STOP must get through behind any rubbish.
+like a header. A STOP must get through behind any rubbish: it is looked for in everything that is
+not part of a whole message, also while the rest of one that will never come is awaited.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.slicer.messages import (
+    COMMAND_HEAD,
     EXTENDED_HEADER,
     HEADER,
     META_ENTRY,
@@ -30,9 +32,14 @@ from service.slicer.messages import (
 Array = NDArray[np.float64]
 LARGEST_BODY = 2 * 1024 * 1024
 _LARGEST_SKIPPED = 256 * 1024 * 1024
+_LARGEST_STOP = 1024
+_LOOKED_BACK = 64 * 1024
+_MOST_TRIES = 16
 _TYPE = re.compile(rb"[A-Z][A-Z0-9_]{1,11}\0*")
+_STOP_TYPE = re.compile(rb"STRING\0{6}|COMMAND\0{5}")
 _VERSIONS = (1, 2)
 _PLAUSIBLE_VERSIONS = range(1, 10)
+STOPS = ("STOP", "EMERGENCY")
 
 
 class MessageError(ValueError):
@@ -64,25 +71,42 @@ class Stream:
 
     def __init__(self) -> None:
         self._waiting = bytearray()
+        self._at = 0  # where in the stream `_waiting` begins
         self._skip = 0
         self._lost = False
+        self._tries = 0
+        self._stops = _StopsAhead()
         self.faults: Counter[str] = Counter()
 
     def feed(self, data: bytes) -> list[Received]:
-        """Take bytes; return the messages that are whole by now, in their order."""
+        """Take bytes; return the messages that are whole by now, in their order, and any STOP that
+        stands behind them, whatever is awaited in front of it.
+        """
         self._waiting += data
-        return list(self._messages())
+        self._stops.feed(data)
+        return [*self._messages(), *self._stops.found()]
 
     @property
     def is_waiting(self) -> bool:
         """Whether the rest of a message is awaited."""
         return bool(self._waiting or self._skip)
 
+    @property
+    def front(self) -> int:
+        """Changes whenever another message is awaited than before."""
+        return self._at + self._skip
+
+    def resume(self) -> list[Received]:
+        """A message is awaited for long: give it up if whole ones come behind its start. A large
+        one on a slow line contains none, and goes on being awaited.
+        """
+        return self.give_up() if self._skip or self._has_whole_ones() else []
+
     def give_up(self) -> list[Received]:
         """The rest of a message does not come: look for whole ones behind its start."""
         self._skip = 0
         if len(self._waiting) < HEADER.size:
-            self._waiting.clear()
+            self._drop(len(self._waiting))
             return []
         self._find_header("cut off")
         return list(self._messages())
@@ -91,8 +115,8 @@ class Stream:
         while True:
             if self._skip:
                 gone = min(self._skip, len(self._waiting))
-                del self._waiting[:gone]
                 self._skip -= gone
+                self._drop(gone)
             if len(self._waiting) < HEADER.size:
                 return
             version, kind, device, _, size, crc = HEADER.unpack_from(self._waiting)
@@ -110,19 +134,97 @@ class Stream:
                 # its length may be what is wrong: what follows is looked for inside of it too
                 self._find_header("crc")
                 continue
-            del self._waiting[: HEADER.size + size]
-            self._lost = False
-            try:
-                yield _received(version, _text(kind), _text(device), body)
-            except MessageError:
+            begun_at = self._at
+            self._drop(HEADER.size + size)
+            self._stops.whole_until(self._at)
+            self._lost, self._tries = False, 0
+            found = _received_if_sound(version, _text(kind), _text(device), body)
+            if found is None:
                 self.faults["meta-data"] += 1
+            elif not (stop_word(found) and self._stops.was_heard(begun_at)):
+                yield found
 
     def _find_header(self, fault: str) -> None:
-        """Drop what stands before the next thing that could be a header; one fault until then."""
+        """Drop what stands before the next thing that could be a header; one fault until then.
+
+        Who sends header after header that is none must not keep the room busy: after some of them
+        everything that has come is dropped.
+        """
         if not self._lost:
             self.faults[fault] += 1
             self._lost = True
-        del self._waiting[: _next_header(bytes(self._waiting))]
+        self._tries += 1
+        if self._tries > _MOST_TRIES:
+            self._tries = 0
+            self._drop(len(self._waiting))
+        else:
+            self._drop(_next_header(bytes(self._waiting)))
+
+    def _drop(self, number: int) -> None:
+        del self._waiting[:number]
+        self._at += number
+
+    def _has_whole_ones(self) -> bool:
+        """Among the newest bytes, behind the start of what is awaited."""
+        newest = bytes(self._waiting[HEADER.size :][-_LOOKED_BACK:])
+        tried = 0
+        for match in _TYPE.finditer(newest, 2):
+            start = match.start() - 2
+            if tried == _MOST_TRIES or len(newest) < start + HEADER.size:
+                break
+            version, kind, _, _, size, crc = HEADER.unpack_from(newest, start)
+            body = newest[start + HEADER.size : start + HEADER.size + size]
+            if version in _VERSIONS and _TYPE.fullmatch(kind) and 0 < size == len(body):
+                if crc64(body) == crc:
+                    return True
+                tried += 1
+        return False
+
+
+class _StopsAhead:
+    """STOPs in what is not (yet) part of a whole message; each byte is looked at once or twice."""
+
+    def __init__(self) -> None:
+        self._bytes = bytearray()
+        self._at = 0
+        self._heard_until = 0
+
+    def feed(self, data: bytes) -> None:
+        self._bytes += data
+
+    def whole_until(self, at: int) -> None:
+        """What came before this place of the stream was a message and said what it said."""
+        self._drop(at - self._at)
+
+    def was_heard(self, at: int) -> bool:
+        return at < self._heard_until
+
+    def found(self) -> Iterator[Received]:
+        """Each once; what may still become one is kept."""
+        keep_from = max(0, len(self._bytes) - HEADER.size + 1)
+        for match in _STOP_TYPE.finditer(bytes(self._bytes), 2):
+            start = match.start() - 2
+            if len(self._bytes) < start + HEADER.size:
+                break
+            version, kind, device, _, size, crc = HEADER.unpack_from(self._bytes, start)
+            if version not in _VERSIONS or size > _LARGEST_STOP:
+                continue
+            end = start + HEADER.size + size
+            if len(self._bytes) < end:
+                keep_from = min(keep_from, start)
+                continue
+            body = bytes(self._bytes[start + HEADER.size : end])
+            said = _received_if_sound(version, _text(kind), _text(device), body)
+            is_new = not self.was_heard(self._at + start)
+            if is_new and said is not None and stop_word(said) and crc64(body) == crc:
+                self._heard_until = self._at + end
+                yield said
+        self._drop(keep_from)
+
+    def _drop(self, number: int) -> None:
+        if number > 0:
+            self._at += number
+            del self._bytes[:number]
 
 
 def _next_header(waiting: bytes) -> int:
@@ -143,6 +245,15 @@ def _is_plausible(version: int, kind: bytes, size: int) -> bool:
         and _TYPE.fullmatch(kind) is not None
         and size <= _LARGEST_SKIPPED
     )
+
+
+def _received_if_sound(version: int, kind: str, device: str, body: bytes) -> Received | None:
+    """None where its meta-data lie; a STOP is one whatever they say."""
+    try:
+        return _received(version, kind, device, body)
+    except MessageError:
+        bare = Received(version, kind, device, body[EXTENDED_HEADER.size :])
+        return bare if stop_word(bare) else None
 
 
 def _received(version: int, kind: str, device: str, body: bytes) -> Received:
@@ -177,6 +288,24 @@ def _meta(index: bytes, values: bytes) -> dict[str, str]:
         )
         at += name_size + value_size
     return found
+
+
+def stop_word(message: Received) -> str:
+    """STOP or EMERGENCY if the message says so, however it is addressed; else nothing."""
+    try:
+        text = _text_of(message).upper()
+    except MessageError:
+        return ""
+    return text if text in STOPS else ""
+
+
+def _text_of(message: Received) -> str:
+    if message.kind == "STRING":
+        return string_of(message)
+    if message.kind == "COMMAND" and len(message.content) >= COMMAND_HEAD.size:
+        _, name, _, _ = COMMAND_HEAD.unpack_from(message.content)
+        return _text(name)
+    return ""
 
 
 def string_of(message: Received) -> str:

@@ -116,7 +116,7 @@ class OpenIgtLinkServer:
 
     def pose(self) -> Pose | None:
         """Reads the record: not for the event loop's thread."""
-        return self._from_record(lambda state, record: pose_of(state, record, self._config), None)
+        return self._from_record(self._pose, None)
 
     async def _watch(self) -> None:
         revision, told_s = -1, 0.0
@@ -132,14 +132,17 @@ class OpenIgtLinkServer:
             more = await asyncio.to_thread(self._from_record, self._read, {})
             self.scene = scene | more
             for peer in list(self._peers):
-                peer.look(state.proposals)
+                peer.look(state)
 
     def _read(self, state: RoomState, record: CaseRecord | None) -> Scene:
-        pose = pose_of(state, record, self._config)
+        pose = self._pose(state, record)
         return {
             CURRENT_POSITION: pose_message(pose, state.at_s),
             **self._images.of(state, record),
         }
+
+    def _pose(self, state: RoomState, record: CaseRecord | None) -> Pose | None:
+        return pose_of(state, record, self._config, self._loop.now)
 
     def _from_record(
         self, look: Callable[[RoomState, CaseRecord | None], Found], otherwise: Found

@@ -180,7 +180,8 @@ class Broadcast:
             self.viewers -= 1
 
     def _kept_since(self, after_id: int) -> tuple[bytes, int]:
-        if not self._events or self._events[-1][0] <= after_id:
+        """What is kept after an id; nothing where something in between is not: it is `_missed`."""
+        if not self._keeps_all_since(after_id) or self._events[-1][0] <= after_id:
             return b"", after_id
         new: list[bytes] = []
         for event_id, message in reversed(self._events):

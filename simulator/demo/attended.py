@@ -16,7 +16,7 @@ from simulator.faults import FAULTS
 
 _POLL_S = 0.2
 _STEPS = (
-    "Arm the robot.",
+    "Confirm the stage positions (here the assumed ones are right), which arms the robot.",
     "Start the calibration; the virtual scanner answers each request by itself.",
     "Pick target: click on the slice, then Set target{entry}.",
     "Start the approach. Check each move, then CONFIRM MOVE, until READY.",

@@ -74,7 +74,9 @@ def demo(
                 file=sys.stderr,
             )
             return BAD_INPUT
-    folder = case or Path(tempfile.mkdtemp(prefix="autospine-demo-"))
+    # a folder of its own: the page lists the cases that lie beside this one
+    home = case or Path(tempfile.mkdtemp(prefix="autospine-demo-"))
+    folder = case or home / "demo"
     folder.mkdir(parents=True, exist_ok=True)
     code = INTERRUPTED
     with _signals():
@@ -95,7 +97,7 @@ def demo(
         else:
             code = _run(DemoRoom(options), punctures, leave=exit_, as_json=json_)
     if case is None and code != COULD_NOT:
-        shutil.rmtree(folder, ignore_errors=True)  # what failed may be gone on with
+        shutil.rmtree(home, ignore_errors=True)  # what failed may be gone on with
     return code
 
 

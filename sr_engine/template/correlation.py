@@ -2,7 +2,8 @@
 
 Scanners filter, interpolate and denoise what they show, each in its own way: no list of names
 covers it. What is left of several frames of one object beside their common image is noise, and
-shows its correlation at the place where it counts.
+shows its correlation. It is not the same everywhere: the magnitudes of air are less correlated than
+those of a signal, and a denoised plateau more. What counts for a place is the object's edge.
 """
 
 from dataclasses import dataclass
@@ -58,27 +59,40 @@ class Colour:
 
 @dataclass(frozen=True, eq=False)
 class Lags:
-    """Sums over pairs of pixels of a mask (rows, cols), at lags (0..reach rows, 0..reach columns).
+    """Means over pairs of pixels, at lags (0..reach rows, 0..reach columns).
 
-    Lags to the left and to the right are taken together. pairs: how many of one patch.
+    weights (rows, cols): what each pixel counts; 0 outside of the mask. Lags to the left and to the
+    right are taken together.
     """
 
-    mask: Mask
+    weights: Array
     reach: int
 
+    @property
+    def mask(self) -> Mask:
+        return self.weights > 0
+
     @cached_property
+    def total(self) -> Array:
+        return np.maximum(self._sums(*[self.weights[None]] * 2), 1e-9)
+
+    @property
     def pairs(self) -> Array:
-        return np.maximum(self._sums(*[self.mask[None].astype(np.float64)] * 2), 1.0)
+        """How many pairs of one patch these are worth."""
+        return self.total**2 / np.maximum(self._sums(*[self.weights[None] ** 2] * 2), 1e-9)
 
     def mean(self, first: Array, second: Array) -> Array:
         """Mean product of pixels of first (M, rows, cols) with those of second, at each lag."""
-        return self._sums(first, second) / self.pairs
+        weighed = first * self.weights
+        return (
+            self._sums(weighed, weighed if second is first else second * self.weights) / self.total
+        )
 
     def _sums(self, first: Array, second: Array) -> Array:
         reach = self.reach
         shape = tuple(scipy.fft.next_fast_len(n + reach, real=True) for n in self.mask.shape)
-        spectra = scipy.fft.rfft2(np.where(self.mask, first, 0.0), shape)
-        others = spectra if second is first else scipy.fft.rfft2(second * self.mask, shape)
+        spectra = scipy.fft.rfft2(first, shape)
+        others = spectra if second is first else scipy.fft.rfft2(second, shape)
         lags = scipy.fft.irfft2(np.sum((spectra.conj() * others).real, axis=0), shape)
         folded = lags[: reach + 1, : reach + 1].copy()
         folded[:, 1:] += lags[: reach + 1, : -reach - 1 : -1]

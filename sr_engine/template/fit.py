@@ -39,8 +39,9 @@ class Metric:
 
     mask (n, n): pixels of the patch that count. kind "rician": magnitudes of so many channels, of
     noise std sigma each; "gaussian": other pixels. scales (3,): variance of air, edge and plateau,
-    top being its level, over that of the magnitudes, or as it is. colour: correlation of the
-    noise, None where it is white; is_weighed: whether the fit heeds it. widened: factor of the
+    top being its level, over that of the magnitudes, or as it is. slope: std of the surroundings'
+    slopes, of top a pixel. colour: correlation of the noise at the object's edge, None where it is
+    white; weighing: of all pixels, where the fit heeds it. widened: factor of the
     covariance.
     """
 
@@ -50,8 +51,9 @@ class Metric:
     scales: Array
     channels: float = 1.0
     top: float = 1.0
+    slope: float = SLOPE_SCALES[0]
     colour: Colour | None = None
-    is_weighed: bool = False
+    weighing: Colour | None = None
     widened: float = 1.0
 
     @classmethod
@@ -73,9 +75,7 @@ class Metric:
 
     def weighed(self, rows: Array) -> Array:
         """(c, p) rows, as the fit weighs them."""
-        if self.colour is None or not self.is_weighed:
-            return rows
-        return self.colour.weighed(rows.T, self.mask).T
+        return rows if self.weighing is None else self.weighing.weighed(rows.T, self.mask).T
 
     @cached_property
     def places(self) -> tuple[Array, Array]:
@@ -110,6 +110,8 @@ class TemplateFit:
 
 class LinearFit(NamedTuple):
     amplitude: float
+    slopes: Array  # (2,) by row and column
+    slope_variance: float
     surroundings: Array  # (n, n) background and slopes
     residual: Array  # (p,)
 
@@ -126,17 +128,22 @@ def linear_fit(values: Array, signal: Array, metric: Metric) -> LinearFit:
     shown = metric.expected(signal)
     basis, system = _linear_system(signal, shown, metric)
     target = basis @ ((values - shown.mean + basis[0]) / shown.variance)
-    a, b, by_row, by_col = np.linalg.solve(system, target)
+    inverse = np.linalg.inv(system)
+    a, b, by_row, by_col = inverse @ target
     x = np.arange(len(metric.mask)) - len(metric.mask) // 2
     plane = b + by_row * x[:, None] + by_col * x[None, :]
     again = metric.expected(max(float(a), 0.0) * signal)
-    return LinearFit(float(a), plane, values - again.mean - plane[metric.mask])
+    left = values - again.mean - plane[metric.mask]
+    slopes, variance = np.array([by_row, by_col]), float(np.diag(inverse)[2:].mean())
+    return LinearFit(float(a), slopes, variance, plane, left)
 
 
 def _linear_system(signal: Array, shown: Expected, metric: Metric) -> tuple[Array, Array]:
     row, col = metric.places
     basis = np.stack([signal * shown.slope, np.ones(row.size), row, col])
-    prior = _prior(np.zeros(6), metric)[_AMPLITUDE:] if metric.kind == "rician" else np.zeros(4)
+    prior = np.zeros(4)
+    if metric.kind == "rician":
+        prior[1] = 1 / (_BACKGROUND_SCALE * metric.top) ** 2
     system = (basis / shown.variance) @ basis.T
     system.flat[::5] += prior + 1e-12 * system.diagonal()
     return basis, system
@@ -151,9 +158,10 @@ def taken_by_fit(signal: Array, metric: Metric) -> Array:
 
 
 def _prior(parameters: Array, metric: Metric) -> Array:
-    """(6,) inverse variances: as in `signal`, slopes are weak or strong, a magnitude's air dark."""
+    """(6,) inverse variances: slopes as the template's frames have them, or strong as in `signal`;
+    a magnitude's air is dark."""
     precision = np.zeros(6)
-    slopes = mixture_precision(parameters[4:] / metric.top, SLOPE_SCALES)
+    slopes = mixture_precision(parameters[4:] / metric.top, (metric.slope, SLOPE_SCALES[1]))
     precision[4:] = slopes / metric.top**2
     if metric.kind == "rician":
         precision[_BACKGROUND] = 1 / (_BACKGROUND_SCALE * metric.top) ** 2

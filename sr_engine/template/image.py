@@ -8,9 +8,9 @@ such an image with noise in one or several complex channels, by expectation maxi
 of each pixel is that of the present image, its expected size as in `magnitude`). Pixels that are no
 magnitudes any more (smoothed, denoised) are averaged as they are.
 
-Every frequency is drawn to its annulus's own course (of a round object all there is) as far as
-what differs from it shows no more than noise: a round fiducial costs a few numbers, and any other
-shape is not presumed to be round.
+Every frequency is drawn to the course of what is the same all round (of a round object all there
+is) as far as what differs from it, there and near by, shows no more than noise: a round fiducial
+costs a few numbers, and any other shape is not presumed to be round.
 Unit: pixels. Patches are square, of even size n; the object is centred at index n//2.
 """
 
@@ -20,6 +20,7 @@ from functools import lru_cache
 import numpy as np
 import scipy.fft
 from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
 
 from sr_engine.template.magnitude import expected, in_phase_share
 
@@ -30,7 +31,9 @@ _FIRST_STEPS, _STEPS = 6, 12
 _LIFTS = (0.0, 0.15)  # of the highest value: what is taken for a sign change, inside of the object
 _LIFTED = 0.35  # pixels below this share of it
 _TILT = 0.05  # of the phase over a radius: a real image would stay real for ever
-_LEAST_POWER = 1e-3  # of the noise: what an annulus is left with
+_ALIKE = 1.2  # frequencies over which the power of what is not round is alike
+_FLOOR = 0.3  # of the noise, taken off it: to keep too little of the object costs more
+_LEAST_POWER = 1e-3  # of the noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,8 +152,7 @@ class _Average:
         self.total = float(np.sum(self.shares))
         power = channels * views.sigma**2 * float(np.sum(views.windows**2)) / len(views.windows)
         self.noise = power / self.total * views.noise_power
-        self.annuli, self.counts, self.round = _annuli(n)
-        self.floor = np.bincount(self.annuli.ravel(), self.noise.ravel()) / self.counts
+        self.round = _round_basis(n)
 
     def parts(self, patches: Complex) -> Complex:
         """(M, n, n) what each view, in FFT order about the object, adds to the mean."""
@@ -165,8 +167,8 @@ class _Average:
 
     def kept(self, mean: Complex) -> Array:
         """The share of what is not the same all round that is more than noise."""
-        power = np.bincount(self.annuli.ravel(), (np.abs(mean) ** 2).ravel()) / self.counts
-        object_power = np.maximum(power - self.floor, _LEAST_POWER * self.floor)[self.annuli]
+        power = gaussian_filter(np.abs(mean) ** 2, _ALIKE, mode="wrap", truncate=2.5)
+        object_power = np.maximum(power - _FLOOR * self.noise, _LEAST_POWER * self.noise)
         return np.asarray(object_power / (object_power + self.noise))
 
     def projected(self, spectra: Complex) -> Complex:
@@ -201,13 +203,11 @@ def _axes(n: int) -> tuple[Complex, Array]:
 
 
 @lru_cache(maxsize=8)
-def _annuli(n: int) -> tuple[NDArray[np.int_], Array, Array]:
-    """Annulus of each frequency, how many each has, and a basis of what is the same all round."""
+def _round_basis(n: int) -> Array:
+    """Of what is the same all round."""
     k = np.abs(np.fft.fftfreq(n, 1 / n))
     away = np.hypot(k[:, None], k[None, :])
-    annuli = np.rint(away).astype(int)
-    counts = np.bincount(annuli.ravel()).astype(np.float64)
-    return annuli, counts, _radial_basis(away.ravel())
+    return _radial_basis(away.ravel())
 
 
 def _radial_basis(k: Array) -> Array:

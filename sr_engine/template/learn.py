@@ -48,9 +48,12 @@ _LEVEL_PIXELS = 300.0  # what the noise of all levels weighs, beside that of one
 _LEAST_LEVEL_PIXELS = 30.0  # the same, of pixels that are no magnitudes
 _MAGNITUDES, _NO_MAGNITUDES = 1.4, 2.5  # unevenness: below they are, beyond they are none
 _MOST_SCATTER = 12.0  # chi2 a degree of freedom of the displacements: more is no chance
+_MOST_ALONE = 36.0  # of the others' chi2 that is usual: one in 10^7 frames by chance
 _LEAST_NOISE = 0.05  # of the noise power at any frequency: none is without
 _PRIOR_FRAMES = 10.0  # what the pixels' own account of the noise weighs, in frames
 _LEAST_VARIANCE = 0.1  # of a level's noise, over that of all: denoised air is not sure
+_LEAST_WEIGHT = 0.1  # of a pixel away from the edge, where correlation is measured
+_LEAST_SLOPE = 2e-4  # of the highest signal, a pixel: surroundings are never quite even
 _LEAST_SIGNIFICANCE = 8.0  # of the amplitude
 
 
@@ -200,7 +203,7 @@ def _begun(stack: Array, found: Moving, shifts: Array) -> _Seen:
     mask = _distance(patches.shape[1]) <= reach
     averaged = averaged_image(views)
     metric = replace(Metric.white(mask, views.sigma, None), top=_top(averaged.shown, mask))
-    amplitudes, surroundings, _ = _levels_of(patches, averaged.shown, metric)
+    amplitudes, surroundings, *_ = _levels_of(patches, averaged.shown, metric)
     views = replace(views, patches=patches, amplitudes=amplitudes / amplitudes.mean())
     air = patches[:, ~mask]
     return _Seen(found, views, mask, surroundings, channels_of_air(air), float(np.mean(air**2)))
@@ -227,8 +230,9 @@ def _top(images: Array, mask: NDArray[np.bool_]) -> float:
     return max(float(np.percentile(images[:, mask], 97)), 1e-12)
 
 
-def _levels_of(patches: Array, shown: Array, metric: Metric) -> tuple[Array, Array, Array]:
-    """Amplitudes (M,), surroundings (M, n, n) and what is left (M, n, n) of the patches."""
+def _levels_of(patches: Array, shown: Array, metric: Metric) -> tuple[Array, Array, Array, float]:
+    """Amplitudes (M,), surroundings (M, n, n), what is left (M, n, n) of the patches, and the
+    slopes of the surroundings, std relative to the highest signal."""
     mask = metric.mask
     fits = [
         linear_fit(patch[mask], signal[mask], metric)
@@ -241,7 +245,9 @@ def _levels_of(patches: Array, shown: Array, metric: Metric) -> tuple[Array, Arr
         )
     left = np.zeros_like(patches)
     left[:, mask] = [fit.residual for fit in fits]
-    return amplitudes, np.array([fit.surroundings for fit in fits]), left
+    slopes = np.mean([np.mean(fit.slopes**2) - fit.slope_variance for fit in fits])
+    slope = max(float(np.sqrt(max(slopes, 0.0))) / metric.top, _LEAST_SLOPE)
+    return amplitudes, np.array([fit.surroundings for fit in fits]), left, slope
 
 
 def _learnt(seen: _Seen, channels: float | None) -> _Learnt:
@@ -258,12 +264,13 @@ def _learnt(seen: _Seen, channels: float | None) -> _Learnt:
         else:
             averaged = magnitude_image(views, channels, seen.found.radius_px, start)
         metric = replace(metric, top=_top(averaged.shown, seen.mask))
-        amplitudes, surroundings, left = _levels_of(patches, averaged.shown, metric)
+        amplitudes, surroundings, left, slope = _levels_of(patches, averaged.shown, metric)
+        metric = replace(metric, slope=slope)
         mean = float(amplitudes.mean())
         averaged = averaged.scaled(mean)
         start = averaged.image.spectrum
         metric = _measured(metric, left, averaged.shown, averaged.extra)
-        power = views.noise_power if metric.colour is None else metric.colour.power
+        power = views.noise_power if metric.weighing is None else metric.weighing.power
         views = replace(
             views, amplitudes=amplitudes / mean, noise_power=np.maximum(power, _LEAST_NOISE)
         )
@@ -290,15 +297,25 @@ def _measured(metric: Metric, left: Array, shown: Array, extra: float) -> Metric
     standard = np.zeros_like(left)
     standard[:, mask] = left[:, mask] / np.sqrt(metric.expected(pixels).variance)
     taken = taken_by_fit(pixels.mean(axis=0), metric)
-    lost, table, error = lag_correlation(standard, Lags(mask, LAGS_PX), taken)
-    lags = believed(table, error)
-    colour = None if lags is None else Colour.of_lags(lags, len(mask))
-    return replace(metric, scales=scales * lost, colour=colour)
+    colours, lost = [], 1.0
+    for weights in (_at_edge(shown, mask), mask.astype(np.float64)):
+        lost, table, error = lag_correlation(standard, Lags(weights, LAGS_PX), taken)
+        lags = believed(table, error)
+        colours.append(None if lags is None else Colour.of_lags(lags, len(mask)))
+    return replace(metric, scales=scales * lost, colour=colours[0], weighing=colours[1])
+
+
+def _at_edge(shown: Array, mask: NDArray[np.bool_]) -> Array:
+    """(n, n) how steep the image is on average, 1 at most; a little everywhere in the mask."""
+    by_row, by_col = np.gradient(shown, axis=(1, 2))
+    steep = np.hypot(by_row, by_col).mean(axis=0)
+    return np.where(mask, np.maximum(steep / steep[mask].max(), _LEAST_WEIGHT), 0.0)
 
 
 def _weighings(metric: Metric) -> list[Metric]:
     """The ways to weigh the pixels: alike, and by their correlation where there is any."""
-    return [metric] if metric.colour is None else [metric, replace(metric, is_weighed=True)]
+    plain = replace(metric, weighing=None)
+    return [plain] if metric.weighing is None else [plain, metric]
 
 
 def _checked(
@@ -403,7 +420,9 @@ def _placed(
 
 def _refuse_scattered(placed: _Placed) -> None:
     scatter = placed.chi2
-    if not scatter < _MOST_SCATTER:
+    typical = max(float(np.median(placed.squares)), 1.0) / (2 * np.log(2))
+    # what one wrong displacement leaves is taken for noise in part, in all frames alike
+    if not (scatter < _MOST_SCATTER and placed.squares.max() < _MOST_ALONE * typical):
         worst = int(np.argmax(placed.squares))
         row, col = placed.apart_px[worst]
         raise TemplateError(

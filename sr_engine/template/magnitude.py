@@ -47,7 +47,12 @@ def expected(signal: Array, sigma: float, channels: float) -> Expected:
 
 def in_phase_share(z: Array, channels: float) -> Array:
     """I_n(z)/I_(n-1)(z), z = ys/sigma^2: a magnitude y tells of its signal s y times this."""
-    return np.interp(z / (z + channels), _SHARES, _bessel_ratio(_rounded(channels)))
+    table = _bessel_ratio(_rounded(channels))
+    z = np.maximum(z, 0.0)  # a pixel below 0 is no magnitude, and tells nothing
+    place = z / (z + channels) * (len(_SHARES) - 1)
+    below = np.minimum(place.astype(np.intp), len(_SHARES) - 2)
+    low = table.take(below)
+    return np.asarray(low + (place - below) * (table.take(below + 1) - low))
 
 
 def channels_of_air(air: Array) -> float | None:

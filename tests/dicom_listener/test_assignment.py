@@ -19,7 +19,8 @@ from dicom_listener.assign import (
     Quarantined,
     assign,
 )
-from dicom_listener.clock import OffsetBounds, OffsetUnknown, Promptness
+from dicom_listener.clock import OffsetBounds, OffsetUnknown
+from dicom_listener.promptness import Promptness, Witness
 from dicom_slice.reasons import Reason
 from dicom_slice.times import AcquisitionInterval
 
@@ -222,6 +223,7 @@ troubles = st.builds(
     no_duration=st.sampled_from((0.0, 0.2, 1.0)),
     estimated=st.sampled_from((0.0, 0.3, 1.0)),
     synchronizes=st.booleans(),
+    stack=st.sampled_from((1, 1, 3, 5)),
 )
 
 
@@ -260,6 +262,7 @@ def all_troubles(dice: random.Random, knowledge: str) -> Trouble:
         no_duration=dice.choice((0, 0, 0.2, 1)),
         estimated=dice.choice((0, 0, 0.3, 1)),
         synchronizes=dice.random() < 0.3,
+        stack=dice.choice((1, 1, 3, 5)),
     )
 
 
@@ -352,6 +355,19 @@ def test_the_generator_does_catch_an_assignment_that_is_too_trusting():
         return bool(Trusting(dice, trouble).run(6).wrong)
 
     assert any(is_wrong(seed) for seed in range(100))
+
+
+def test_the_generator_does_catch_a_stack_that_is_its_own_witness(monkeypatch):
+    """With every slice a witness for itself, the same days give wrong assignments."""
+    monkeypatch.setattr(Witness, "is_one_with", lambda self, other: False)
+
+    def is_wrong(seed: int) -> bool:
+        dice = random.Random(seed)
+        trouble = any_trouble(dice, "promptness")
+        trouble = replace(trouble, delays="regular", early=0.5, held_up=0.3, steps=0, stack=5)
+        return bool(VirtualDay(dice, trouble).run(3).wrong)
+
+    assert any(is_wrong(seed) for seed in range(300))
 
 
 def test_the_generator_does_catch_a_promptness_that_nobody_measured():

@@ -21,12 +21,11 @@ from dicom_listener.clock import (
     Comparison,
     OffsetBounds,
     OffsetUnknown,
-    Promptness,
     Received,
     ScannerClock,
     observe,
 )
-from dicom_listener.promptness import TooFewDelaysError, promptness_of
+from dicom_listener.promptness import Promptness, TooFewDelaysError, promptness_of
 from dicom_listener.scanner_clocks import Drift, ScannerClocks
 from dicom_slice.elements import Elements, frame_elements
 from dicom_slice.header import slices_of
@@ -109,8 +108,31 @@ def test_a_reference_far_from_its_acquisition_makes_the_interval_cover_both():
             FrameAcquisitionDuration=1000.0,
         )
     )
-    assert found.start_s == at("2024-01-10T12:00:10+01:00")
+    assert found.start_s == at("2024-01-10T12:00:09+01:00")
     assert found.end_s == at("2024-01-10T13:00:01+01:00")
+
+
+@pytest.mark.parametrize(
+    "timing", [{}, {"RepetitionTime": "50", "NumberOfPhaseEncodingSteps": "64"}]
+)
+def test_a_reference_in_an_acquisition_of_uncertain_duration_is_no_start(timing):
+    data_set = frame_times(FrameReferenceDateTime="20240110120010")
+    for name, value in timing.items():
+        setattr(data_set, name, value)
+    with pytest.raises(ImplausibleTimeError, match="acquisition of unknown duration"):
+        interval_of(data_set)
+    data_set.AcquisitionDateTime = "20240110120020"  # no start of it, for it comes after
+    with pytest.raises(ImplausibleTimeError, match="no start before it"):
+        interval_of(data_set)
+    data_set.AcquisitionDate, data_set.AcquisitionTime = "20240110", "120001"
+    found = interval_of(data_set)
+    assert found.source == "AcquisitionDate+AcquisitionTime"
+    assert found.start_s == at("2024-01-10T12:00:01+01:00")
+    data_set.AcquisitionDateTime = "20240110120000"
+    found = interval_of(data_set)
+    assert found.source == "AcquisitionDateTime"
+    assert found.start_s == at("2024-01-10T12:00:00+01:00")
+    assert found.end_s is None or found.end_s >= at("2024-01-10T12:00:10+01:00")
 
 
 def test_a_duration_is_taken_from_the_header_or_estimated_and_marked_so():
@@ -297,7 +319,7 @@ def test_slices_that_were_held_up_do_not_agree_and_are_not_believed():
         clock = after(clock, slice_, rules=MEASURED)
     unknown = clock.bounds_for(slice_, MEASURED)
     assert isinstance(unknown, OffsetUnknown)
-    assert "no 5 slices arrived as promptly as was measured at this site" in unknown.text
+    assert "no 5 acquisitions arrived, each for itself, as promptly as was measured" in unknown.text
 
 
 def test_with_comparison_and_promptness_an_acquisition_must_be_good_by_both():

@@ -2,6 +2,7 @@
 
 import os
 import time
+from datetime import datetime
 from pathlib import Path
 
 import pytest
@@ -12,15 +13,18 @@ from pydicom.dataset import Dataset
 from pydicom.sequence import Sequence
 from real_slices import DICOM
 
+from case_record.cases import Cases
 from case_record.record import CaseRecord
 from dicom_listener.clock import ClockRules, Comparison
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope, sha256_of
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.operator_actions import give_up_slices, reset_clock, sync_clock
+from dicom_listener.promptness import Promptness
 from dicom_listener.retention import remove_old
 from dicom_slice.eligibility import SliceRules
 from dicom_slice.quirks import ENHANCED_MR_IMAGE
+from service.room.cases.life import begin, reopen
 
 
 class Desk:
@@ -93,6 +97,71 @@ def enhanced(n_frames: int, began_s: float) -> Dataset:
         frames.append(frame)
     data_set.PerFrameFunctionalGroupsSequence = Sequence(frames)
     return data_set
+
+
+def stack(place: int, began_s: float) -> Dataset:
+    """One slice of a stack, in an object of its own."""
+    data_set = mr_data_set(f"1.2.7.{place}", began_s=began_s)
+    data_set.ImagePositionPatient = [-20, 10 + 5 * place, 24]
+    data_set.InstanceNumber = place + 1
+    return data_set
+
+
+def series(place: int, began_s: float) -> Dataset:
+    """One of several short acquisitions that are pushed together."""
+    data_set = stack(place, began_s + 0.3 * place)
+    data_set.AcquisitionDuration, data_set.AcquisitionNumber = 0.2, place + 1
+    return data_set
+
+
+@pytest.mark.parametrize("made", [stack, series])
+@pytest.mark.parametrize("held_up_s", [15.0, 86400.0])
+def test_what_comes_late_at_once_bears_no_witness_to_its_own_promptness(make_desk, made, held_up_s):
+    desk = make_desk(clock=ClockRules(promptness=Promptness(0.0, 2.0)), comparison=None)
+    now_s = time.time()
+    begin_hold(desk.record, now_s - held_up_s / 2, expected=5)
+    for place in range(5):
+        desk.receive(made(place, now_s - held_up_s - 2.0), received_s=now_s + 0.2 * place)
+    assert {row.reason_code for row in desk.record.slices()} == {"clock_unknown"}
+    assert "each for itself" in desk.record.slices()[0].reason
+
+
+def test_the_frames_of_a_late_object_bear_no_witness_to_their_own_promptness(make_desk):
+    desk = make_desk(clock=ClockRules(promptness=Promptness(0.0, 2.0)), comparison=None)
+    begin_hold(desk.record, time.time() - 10, expected=5)
+    rows = desk.receive(enhanced(5, time.time() - 20.5))
+    assert {row.reason_code for row in rows} == {"clock_unknown"}
+
+
+@pytest.mark.parametrize("is_fresh", [True, False])
+def test_files_that_may_have_lain_there_bear_no_witness_to_promptness(make_desk, is_fresh):
+    desk = make_desk(clock=ClockRules(promptness=Promptness(0.0, 2.0)), comparison=None)
+    now_s = time.time()
+    begin_hold(desk.record, now_s - 50, expected=5)
+    for place in range(5):
+        sent = stack(place, now_s - 40 + 8 * place)
+        sent.AcquisitionNumber = place + 1
+        desk.receive(sent, received_s=now_s - 39 + 8 * place, is_fresh=is_fresh)
+    states = {row.state for row in desk.record.slices()}
+    assert states == ({"assigned"} if is_fresh else {"pending"})
+
+
+@pytest.mark.parametrize("says_start", [True, False])
+def test_a_reference_within_the_hold_does_not_hide_a_start_before_it(make_desk, says_start):
+    desk = make_desk(clock=ClockRules(unseen_steps=False))
+    now_s = time.time()
+    begin_hold(desk.record, now_s - 12)
+    sent = enhanced(1, now_s - 20)
+    del sent.AcquisitionDuration
+    if not says_start:
+        del sent.AcquisitionDateTime
+    content = Dataset()
+    content.FrameReferenceDateTime = f"{datetime.fromtimestamp(now_s - 10):%Y%m%d%H%M%S.%f}"
+    sent.PerFrameFunctionalGroupsSequence[0].FrameContentSequence = Sequence([content])
+    (row,) = desk.receive(sent)
+    assert row.state == "quarantined"
+    assert ("before" if says_start else "unknown duration") in row.reason
+    assert row.time_source == ("AcquisitionDateTime" if says_start else "")
 
 
 def test_every_frame_of_one_object_is_a_slice_of_the_hold(make_desk):
@@ -294,3 +363,73 @@ def test_a_clock_that_was_set_is_not_known_again_by_a_restart(make_desk):
         (row,) = room.receive(mr_data_set(f"1.2.{number}", began_s=time.time() - 0.6))
         assert (row.state, row.reason_code) == ("pending", "clock_unknown")
         assert "before the scanner's clock was set" in row.reason
+
+
+class RoomDesk(Desk):
+    """The listener's side of one case of a room, whose scanner's clock nobody sets."""
+
+    def __init__(self, folder: Path, filed: Comparison | None = None) -> None:
+        self.folder, self.record = folder, CaseRecord(folder)
+        self.inbox = Inbox(folder / "inbox")
+        self.rules = IntakeRules(clock=ClockRules(unseen_steps=False), comparison=filed)
+        self.intake = Intake(self.record, self.inbox, self.rules, ListenerMetrics())
+        begin_hold(self.record, time.time() - 15)
+
+    def restart(self) -> None:
+        self.intake.close()
+        self.intake = Intake(self.record, self.inbox, self.rules, ListenerMetrics())
+        self.intake.look_at_record()
+
+    def late_slice(self, number: int) -> str:
+        """Acquired before the hold, by a clock that is 30 s ahead: why it waits."""
+        sent = mr_data_set(f"1.2.1.{number}", began_s=time.time() - 10)
+        sent.AcquisitionNumber = number
+        (row,) = self.receive(sent)
+        assert row.state == "pending", row
+        return row.reason
+
+    def contradict(self, **changes) -> None:
+        self.receive(mr_data_set("1.2.1", began_s=time.time() + 29.4), **changes)
+
+
+def test_what_contradicts_a_comparison_counts_in_the_next_case_and_after_a_restart(tmp_path):
+    cases = Cases(tmp_path)
+    first = RoomDesk(begin(cases, "room", "op", {}))
+    sync_clock(first.record, 0.0, 0.2, "op")
+    first.intake.look_at_record()
+    first.contradict()
+    assert "ahead of the comparison" in first.late_slice(2)
+    second = RoomDesk(begin(cases, "room", "op", {}))
+    assert "ahead of the comparison" in second.late_slice(3)
+    second.restart()
+    assert "ahead of the comparison" in second.late_slice(4)
+    reopen(cases, first.folder.name, "op")
+    first.restart()
+    assert "ahead of the comparison" in first.late_slice(5)
+    sync_clock(first.record, -30.0, 0.2, "op")  # which ends it, in what comes next as well
+    third = RoomDesk(begin(cases, "room", "op", {}))
+    third.receive(mr_data_set("1.2.9", began_s=time.time() + 29.4))
+    assert third.record.last_slice("pending").reason.startswith("it may have been acquired before")
+
+
+def test_a_clock_that_was_set_in_one_case_was_set_in_the_next(tmp_path):
+    cases = Cases(tmp_path)
+    filed = Comparison(0.0, 0.2, time.time() - 600)
+    first = RoomDesk(begin(cases, "room", "op", {}), filed)
+    reset_clock(first.record, "op", "it was set")
+    second = RoomDesk(begin(cases, "room", "op", {}), filed)
+    assert "before the scanner's clock was set" in second.late_slice(1)
+    third = RoomDesk(begin(cases, "room", "op", {}), Comparison(-30.0, 0.2, time.time()))
+    assert "before the scanner's clock was set" in third.late_slice(2)
+
+
+def test_a_slice_that_was_taken_after_a_comparison_contradicts_it_after_a_restart_too(tmp_path):
+    desk = RoomDesk(begin(Cases(tmp_path), "room", "op", {}))
+    received_s = time.time()
+    sync_clock(desk.record, 0.0, 0.2, "op")
+    desk.contradict(received_s=received_s - 0.001)
+    told = desk.late_slice(2)
+    assert "ahead of the comparison" in told
+    desk.restart()
+    assert desk.late_slice(3) == told
+    assert "assigned" not in {row.state for row in desk.record.slices()}

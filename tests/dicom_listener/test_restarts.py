@@ -14,10 +14,11 @@ from made_slices import begin_hold, mr_data_set
 from pydicom.dataset import Dataset
 
 from case_record.record import CaseRecord
-from dicom_listener.clock import ClockRules, Promptness
+from dicom_listener.clock import ClockRules
 from dicom_listener.inbox import Envelope, Inbox, sha256_of
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics
+from dicom_listener.promptness import Promptness
 from dicom_slice.quirks import MR_IMAGE
 
 _BEGAN_S = 1.75e9

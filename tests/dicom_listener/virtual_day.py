@@ -13,19 +13,18 @@ import random
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 
-from made_slices import a_slice
+from made_slices import CORONAL, a_slice
 
 from dicom_listener.assign import Assigned, AssignRules, HoldWindow, Known, assign
 from dicom_listener.clock import (
     ClockRules,
     Comparison,
     Offset,
-    Promptness,
     Received,
     ScannerClock,
     observe,
 )
-from dicom_listener.promptness import FEWEST_DELAYS, promptness_of
+from dicom_listener.promptness import FEWEST_DELAYS, Promptness, promptness_of
 from dicom_slice.header import Slice
 from dicom_slice.reasons import Reason
 from dicom_slice.times import AcquisitionInterval
@@ -42,6 +41,7 @@ class Trouble:
     early: the operator starts before the robot stands.
     steps: how often the scanner's clock is set, forward or back, by little or much.
     synchronizes: it follows a time server in the end, is not set any more, and slices say so.
+    stack: an acquisition gives so many slices or frames, of the same times and sent together.
     """
 
     knowledge: str = "comparison"
@@ -57,6 +57,7 @@ class Trouble:
     no_duration: float = 0.0
     estimated: float = 0.0
     synchronizes: bool = False
+    stack: int = 1
 
 
 @dataclass
@@ -113,7 +114,8 @@ class VirtualDay:
         self.waiting: dict[int, tuple[int, Arrival]] = {}
         self.outcome = Outcome()
         self.arrivals: list[tuple[float, int, Arrival]] = []
-        self.series: list[Arrival] = []
+        self.series: list[tuple[Arrival, ...]] = []
+        self.sent = 0
         self.step_times = sorted(dice.uniform(0, 300) for _ in range(trouble.steps))
         self.steps: list[tuple[float, float]] = []
         self.synchronized_from_s = self.step_times[-1] if self.step_times else 0.0
@@ -143,21 +145,22 @@ class VirtualDay:
 
     def stand(self, settled_s: float, place: int) -> float:
         """One hold: scans are asked for until all slices are there or patience ends."""
-        wanted = self.dice.randint(1, 3)
+        wanted = self.dice.randint(1, 3) * self.trouble.stack
         hold = HoldWindow(place + 1, place // 3, settled_s, None, wanted)
         self.holds.append(hold)
         now_s = settled_s
         patience_s = self.dice.expovariate(1 / 30) + 0.5 if self.chance("impatience") else 600.0
         deadline_s = settled_s + patience_s
         while now_s < deadline_s and self.count(hold) < wanted:
-            now_s = self.scan_some(now_s, wanted - self.count(hold))
+            lacking = wanted - self.count(hold)
+            now_s = self.scan_some(now_s, math.ceil(lacking / self.trouble.stack))
             wait_s = self.dice.uniform(0.5, 15.0) + self.delay_s() * self.dice.choice((0, 1))
             now_s = self.receive_until(min(now_s + wait_s, deadline_s), (hold, wanted))
             self.heed_page(now_s)
         now_s = max(now_s, settled_s + 0.01)
         self.holds[-1] = replace(hold, ended_at_s=now_s)
         if self.chance("extra_scans"):  # somebody scans while the robot moves
-            self.send(self.scan(now_s + self.dice.uniform(-3.0, 3.0), self.dice.uniform(0.1, 3.0)))
+            self.send(*self.scan(now_s + self.dice.uniform(-3.0, 3.0), self.dice.uniform(0.1, 3.0)))
             self.push_series()
         return now_s
 
@@ -172,7 +175,7 @@ class VirtualDay:
         began_s = now_s + self.dice.uniform(-early_s, 3.0)
         for _ in range(count):
             length_s = self.dice.uniform(0.1, 8.0)
-            self.send(self.scan(began_s, length_s))
+            self.send(*self.scan(began_s, length_s))
             began_s += length_s + self.dice.uniform(0.0, 0.5)
         self.push_series()
         return max(now_s, began_s)
@@ -195,9 +198,9 @@ class VirtualDay:
         size_s = self.dice.choice((0.3, 1.0, 5.0, 20.0, 60.0, 3600.0)) * self.dice.random()
         return size_s if self.dice.random() < 0.5 else -size_s
 
-    def scan(self, began_s: float, length_s: float) -> Arrival:
+    def scan(self, began_s: float, length_s: float) -> list[Arrival]:
+        """One acquisition: its slices lie side by side, in objects of their own or as frames."""
         self.number += 1
-        self.uid += 1
         from_s = self.scanner_s(began_s)
         end_s: float | None = from_s + length_s
         estimated = False
@@ -205,29 +208,45 @@ class VirtualDay:
             end_s = None
         elif self.chance("estimated"):
             end_s, estimated = from_s + length_s * self.dice.uniform(1.0, 3.0), True
-        slice_ = a_slice(
-            sop_instance_uid=f"1.2.{self.uid}",
+        common = a_slice(
             interval=AcquisitionInterval(from_s, end_s, "AcquisitionDateTime", estimated),
             acquisition_number=1 if self.trouble.unnumbered else self.number,
             clock_synchronized=self.trouble.synchronizes and began_s > self.synchronized_from_s,
         )
-        return Arrival(began_s, began_s + length_s, math.nan, slice_)
+        n_slices = self.trouble.stack
+        in_one_object = n_slices > 1 and self.dice.random() < 0.5
+        scans = []
+        for place in range(n_slices):
+            self.uid += place == 0 or not in_one_object
+            slice_ = replace(
+                common,
+                sop_instance_uid=f"1.2.{self.uid}",
+                frame=place if in_one_object else 0,
+                n_frames=n_slices if in_one_object else 1,
+                geometry=replace(CORONAL, position_mm=(-40.0, 10.0 + 5 * place, 60.0)),
+            )
+            scans.append(Arrival(began_s, began_s + length_s, math.nan, slice_))
+        return scans
 
-    def send(self, scan: Arrival) -> None:
+    def send(self, *scans: Arrival) -> None:
         if self.chance("loss"):
             return
-        self.series.append(scan)
+        self.series.append(scans)
 
     def push_series(self) -> None:
-        """One by one as they are acquired, or all of them when the last one is."""
-        last_s = max((scan.true_to_s for scan in self.series), default=0.0)
-        for scan in self.series:
-            ready_s = last_s if self.trouble.delays == "series" else scan.true_to_s
+        """Each acquisition in one push as it ends, or all of them when the last one has."""
+        last_s = max((scans[0].true_to_s for scans in self.series), default=0.0)
+        for scans in self.series:
+            ready_s = last_s if self.trouble.delays == "series" else scans[0].true_to_s
             received_s = ready_s + self.delay_s()
             if self.chance("held_up"):
                 received_s += self.dice.uniform(0.0, 120.0)
-            arrival = replace(scan, received_s=received_s)
-            heapq.heappush(self.arrivals, (received_s, len(self.arrivals) + self.uid, arrival))
+            for scan in scans:
+                arrival = replace(scan, received_s=received_s)
+                self.sent += 1
+                heapq.heappush(self.arrivals, (received_s, self.sent, arrival))
+                if scan.slice.n_frames == 1:
+                    received_s += self.dice.uniform(0.0, 0.2)
         self.series.clear()
 
     def receive_until(self, limit_s: float, wanted: tuple[HoldWindow, int] | None) -> float:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -10,6 +11,13 @@ from playwright.sync_api import Browser, Page, expect, sync_playwright
 
 CHROMIUM = Path("/usr/bin/chromium")
 AXE = Path(__file__).parent / "vendored" / "axe.min.js"
+# what axe leaves out unless it is asked for is asked for: contrast of level AAA, size of controls
+_LEVELS = [f"wcag{version}{level}" for version in (2, 21, 22) for level in ("a", "aa", "aaa")]
+_EVERY_LEVEL = {
+    "resultTypes": ["violations"],
+    "runOnly": {"type": "tag", "values": [*_LEVELS, "best-practice"]},
+    "rules": {"color-contrast-enhanced": {"enabled": True}, "target-size": {"enabled": True}},
+}
 _PATIENCE_MS = 60_000.0
 _OPTIONS = [
     "--no-sandbox",
@@ -45,7 +53,7 @@ def violations(page: Page) -> list[str]:
     """What axe finds wrong with the accessibility of what is shown now, in the theme of now."""
     # the page's own policy forbids foreign scripts, as it should: axe comes in through the debugger
     page.evaluate(AXE.read_text(encoding="utf-8") + "; null")
-    found = page.evaluate("axe.run(document, {resultTypes: ['violations']})")
+    found = page.evaluate(f"axe.run(document, {json.dumps(_EVERY_LEVEL)})")
     return [
         f"{v['impact']} {v['id']}: {v['nodes'][0]['html'][:120]} "
         f"{v['nodes'][0].get('failureSummary', '')[:300]}"

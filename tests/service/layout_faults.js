@@ -8,7 +8,7 @@
         if (!e.checkVisibility() || e.closest(".heard, .skip, svg, .view .side, .view .scale")) continue;
         const style = getComputedStyle(e);
         const hasText = [...e.childNodes].some((n) => n.nodeType === 3 && n.textContent.trim());
-        if ((hasText || e.matches("button, select")) && style.display !== "inline" && e.clientWidth) {
+        if ((hasText || e.matches("button, select, p, li, td, th, label, legend, caption")) && style.display !== "inline" && e.clientWidth) {
             if (e.scrollWidth > e.clientWidth + 1) faults.push(`cut: ${name(e)} ${e.scrollWidth} > ${e.clientWidth}`);
             if (style.overflowY !== "visible" && e.scrollHeight > e.clientHeight + 1) faults.push(`cut below: ${name(e)}`);
         }

@@ -15,6 +15,10 @@ from service.client import RoomClient
 SIZES = ((1024, 768), (1280, 800), (1920, 1080), (3840, 2160), (820, 1180))
 THEMES = ("light", "dark")
 LONG = "W" * 200
+# what to do, the button for it, the distance with its sigma
+_IN_ONE_GLANCE = (
+    "#prompt, #confirm, #actions .main, #set-target, #error-body .big:not(.quiet), #error-body .pm"
+)
 _MOST_MOVES = 12
 
 _FAULTS = (Path(__file__).parent / "layout_faults.js").read_text(encoding="utf-8")
@@ -24,6 +28,32 @@ def layout_faults(page: Page) -> list[str]:
     """What is wrong with the layout as it is now, in words."""
     laid_out(page)
     return list(page.evaluate(_FAULTS))
+
+
+def not_in_one_glance(page: Page) -> dict[str, list[str]]:
+    """At each of the sizes; only where anything lies under STOP."""
+    found = {}
+    for width, height in SIZES:
+        page.set_viewport_size({"width": width, "height": height})
+        if covered := covered_by_stop(page):
+            found[f"{width}x{height}"] = covered
+    return found
+
+
+def covered_by_stop(page: Page) -> list[str]:
+    """What should be read in one glance with STOP, and is not: it lies under it or below."""
+    page.evaluate("scrollTo(0, 0)")
+    laid_out(page)
+    return list(
+        page.evaluate(
+            """(glance) => {
+                const foot = document.getElementById("foot").getBoundingClientRect().top;
+                return [...document.querySelectorAll(glance)].filter((e) => e.checkVisibility()
+                    && e.getBoundingClientRect().bottom > foot).map((e) => e.textContent);
+            }""",
+            _IN_ONE_GLANCE,
+        )
+    )
 
 
 def layout_faults_at_all_sizes(page: Page) -> dict[str, list[str]]:
@@ -77,7 +107,7 @@ def states(page: Page, client: RoomClient) -> Iterator[str]:
     expect(page.locator("#depth")).to_be_visible()
     yield "depth"
     client.record_puncture(61.5)
-    expect(page.locator("#said")).to_contain_text("Puncture recorded")
+    expect(page.locator("#prompt")).to_contain_text("Puncture recorded")
     yield "punctured"
     client.needle_out()
 

@@ -235,6 +235,17 @@ def test_a_lost_fiducial_is_said_so(calibrated):
     assert len(room.moves) == moves + 1
 
 
+def test_slices_turned_since_the_calibration_are_refused_before_anything_moves(calibrated):
+    room, calibration = calibrated
+    turned = replace(PLANE, row_direction=PLANE.col_direction, col_direction=PLANE.row_direction)
+    recording = RecordingArguments(sigma_mm=0.05, gate=GATE, geometry=GEOMETRY)
+    moves = len(room.moves)
+    with pytest.raises(ProcedureFailedError, match="orientation differs") as failure:
+        room.run(record_place(recording, replace(calibration, plane=turned)))
+    assert failure.value.code == "plane_changed"
+    assert len(room.moves) == moves
+
+
 def test_an_axis_that_does_not_move_is_named():
     room = make_room(0)
     room.stages["xb"].apply_load(1.05)  # beyond what the motor can push

@@ -210,7 +210,7 @@ def test_a_step_recorded_before_a_field_was_known_is_still_the_same_step(recorde
     prepare(db)
     for step_number, body in db.execute("SELECT number, body FROM step").fetchall():
         older = json.loads(body)
-        for name in ("from_um", "fresh", "slice_position_mm", "shift_sigma_mm"):
+        for name in ("from_um", "fresh", "slice_position_mm", "shift_sigma_mm", "phase"):
             older.pop(name, None)
         db.execute("UPDATE step SET body = ? WHERE number = ?", (json.dumps(older), step_number))
     db.commit()

@@ -86,9 +86,76 @@ def test_a_length_that_is_wrong_does_not_swallow_the_next_message():
     first = bytearray(MESSAGES[1].encoded())
     first[42:50] = struct.pack(">Q", 100_000)
     stream = Stream()
-    assert stream.feed(bytes(first) + MESSAGES[0].encoded()) == []
+    assert stream.feed(bytes(first) + MESSAGES[2].encoded()) == []
     assert stream.is_waiting
-    assert [m.device for m in stream.give_up()] == ["CMD_0001"]
+    assert [m.device for m in stream.give_up()] == ["F"]
+
+
+@pytest.mark.parametrize("claimed", [1_500_000, 200_000_000], ids=["unfinished", "skipped"])
+@pytest.mark.parametrize("kind", [b"IMAGE", b"STRING"])
+def test_a_stop_is_heard_at_once_and_once_behind_a_message_that_never_ends(kind, claimed):
+    """Though the peer is never silent."""
+    tracking, stop = transform("NPOS_1", 0.0, np.eye(3), np.zeros(3)), MESSAGES[0]
+    stream, heard = Stream(), []
+    stream.feed(HEADER.pack(2, kind, b"Scout", 0, claimed, 0) + bytes(500))
+    for _ in range(20):
+        heard += stream.feed(tracking.encoded())
+    now = [m for piece in _cut(stop.encoded(), 7) for m in stream.feed(piece)]
+    assert [string_of(m) for m in now] == ["STOP"]
+    for _ in range(3):
+        heard += stream.feed(tracking.encoded()) + stream.resume() + stream.give_up()
+    assert {m.device for m in heard} == {"NPOS_1"}
+    assert stream.faults.total() <= 2
+
+
+def test_what_is_awaited_for_long_is_given_up_for_what_comes_whole_behind_it():
+    target, stream = MESSAGES[1].encoded(), Stream()
+    assert stream.feed(HEADER.pack(2, b"IMAGE", b"Scout", 0, 1_500_000, 0) + bytes(500)) == []
+    assert stream.resume() == []
+    front = stream.front
+    assert stream.feed(target + target) == []
+    assert stream.front == front
+    assert [m.device for m in stream.resume()] == ["TGT_7", "TGT_7"]
+    assert not stream.is_waiting
+
+
+def test_a_large_message_on_a_slow_line_comes_through():
+    pixels = np.random.default_rng(1).bytes(LARGEST_BODY - 100)
+    stream, heard = Stream(), []
+    for piece in _cut(Message("IMAGE", "Scout", 0.0, pixels).encoded(2), 100_000):
+        heard += stream.feed(piece) + stream.resume()
+    assert [len(m.content) for m in heard] == [len(pixels)]
+    assert not stream.faults
+
+
+def test_headers_within_headers_do_not_keep_the_room_busy(monkeypatch):
+    """Each claims a body that is there, with a CRC that is wrong."""
+    one = HEADER.pack(2, b"IMAGE", b"Scout", 0, 1_000_000, 1)
+    summed = []
+
+    def counted(body: bytes) -> int:
+        summed.append(len(body))
+        return crc64(body)
+
+    monkeypatch.setattr("service.slicer.reading.crc64", counted)
+    stream = Stream()
+    stream.feed((one * 40_000)[: LARGEST_BODY - 100])
+    (heard,) = stream.feed(MESSAGES[0].encoded())
+    assert string_of(heard) == "STOP"
+    assert sum(summed) < 50_000_000
+
+
+def test_a_stop_is_one_whatever_its_meta_data_say():
+    body = bytearray(
+        Message("STRING", "CMD_1", 0.0, MESSAGES[0].content, {"a": "b"}).encoded(2)[58:]
+    )
+    body[4:8] = struct.pack(">I", 10)
+    (heard,) = Stream().feed(with_header(2, b"STRING", len(body), bytes(body)))
+    assert string_of(heard) == "STOP"
+
+
+def _cut(data: bytes, size: int) -> list[bytes]:
+    return [data[at : at + size] for at in range(0, len(data), size)]
 
 
 def test_coordinates_come_as_lps():

@@ -10,7 +10,7 @@ import httpx
 import pytest
 from attended_room import AttendedRoom, arm, calibrated, running_room, stop_all, wait_for
 from browser import laid_out, set_theme, violations
-from page_states import layout_faults_at_all_sizes
+from page_states import layout_faults_at_all_sizes, not_in_one_glance
 from playwright.sync_api import Browser, Page, expect
 
 from service.client import RefusedByServiceError, RoomClient
@@ -69,6 +69,8 @@ def test_a_whole_case_from_calibration_to_the_needle_out_by_clicking(
     wait_for(client.state, lambda s: s.procedure == "calibration")
     wait_for(client.state, lambda s: s.procedure is None and s.calibrated, 120.0)
     expect(page.locator("#prompt")).to_contain_text("target")
+    phase = page.locator("#phases [aria-current]")
+    expect(phase).to_have_text("Planning")
     before = client.state().target_patient_mm
     pick_target(page, client, 2.5, -3.0)
     target = wait_for(
@@ -81,6 +83,7 @@ def test_a_whole_case_from_calibration_to_the_needle_out_by_clicking(
     # rows grow towards the feet, columns towards the left; a click is exact to a pixel of screen
     moved = [a - b for a, b in zip(target, measured.patient_mm, strict=True)]
     assert moved == pytest.approx([-3.0, 0.0, -2.5], abs=0.5)
+    expect(phase).to_have_text("Targeting")
     button(page, "Start the approach")
     prompt = page.locator("#prompt")
     confirm, ready = page.locator("#confirm"), page.locator("#prompt.ready")
@@ -89,6 +92,7 @@ def test_a_whole_case_from_calibration_to_the_needle_out_by_clicking(
         if ready.is_visible():
             break
         assert "mm" in page.locator("#question").inner_text()
+        expect(phase).to_have_text("Move to target")
         confirm.click()
         expect(confirm).to_have_count(0, timeout=SLOW_MS)
     expect(prompt).to_contain_text("READY", timeout=SLOW_MS)
@@ -107,6 +111,7 @@ def test_a_whole_case_from_calibration_to_the_needle_out_by_clicking(
     assert events["puncture"].body["insertion_depth_mm"] == 61.5
     assert events["puncture"].who == "operator"
     expect(page.locator("#events")).to_contain_text("Needle out")
+    expect(page.locator("#events")).to_contain_text("insertion depth 61.500 mm")
 
 
 def test_the_overlay_shows_the_fiducial_where_it_was_measured(
@@ -370,6 +375,7 @@ def test_the_loss_and_return_of_the_bridge_are_shown_and_where_the_stages_stand_
     assert f"{high_um / 1000:.2f}" in wrong.inner_text()
     assert not violations(page)
     assert not layout_faults_at_all_sizes(page)
+    assert not not_in_one_glance(page)
     page.set_viewport_size({"width": 1280, "height": 800})
     assert not client.state().robot.armed
     assert "position_declared" not in {event.kind for event in client.events(after=before)}

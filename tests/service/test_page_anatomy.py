@@ -10,7 +10,7 @@ import pytest
 from attended_room import AttendedRoom, arm, calibrated, running_room, wait_for
 from browser import laid_out
 from lone_service import running_service
-from page_states import layout_faults
+from page_states import layout_faults, layout_faults_at_all_sizes, not_in_one_glance
 from playwright.sync_api import Browser, Page, expect
 from pydicom.uid import generate_uid
 from pynetdicom import AE
@@ -150,6 +150,9 @@ def test_with_four_axes_each_fiducials_distance_is_shown_before_each_confirm(
         page.get_by_role("button", name="Cancel").click()
         client.set_target((x + 3.0, y - 82.0, z - 2.0))
         client.start_approach()
+        expect(page.locator("#confirm")).to_be_enabled()
+        assert not layout_faults_at_all_sizes(page)
+        assert not not_in_one_glance(page)
         shown = confirm_each(page, client)
         assert shown
         for upper, lower, tip in shown:

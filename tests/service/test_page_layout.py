@@ -1,25 +1,33 @@
 """How the page is laid out, in a real Chromium: five sizes, every state, the longest names."""
 
+import re
+
 import pytest
 from attended_room import AttendedRoom, arm, calibrated, stop_all, wait_for
-from browser import laid_out
+from browser import laid_out, set_theme, violations
 from lone_service import running_service
-from page_states import LONG, SIZES, layout_faults_at_all_sizes, states
+from page_states import LONG, SIZES, THEMES, layout_faults_at_all_sizes, not_in_one_glance, states
 from playwright.sync_api import Browser, Page, expect
 
 from service.client import RoomClient
 from service.web.access import new_token, token_hash
 
 
-def test_nothing_is_cut_and_nothing_scrolls_by_itself_in_any_state_at_any_size(
+def test_nothing_is_cut_or_scrolls_by_itself_or_lies_under_stop_or_is_hard_to_read_in_any_state(
     page: Page, client: RoomClient
 ) -> None:
-    client.describe_case(LONG, LONG, LONG)
     wrong = {}
     for state in states(page, client):
-        if faults := layout_faults_at_all_sizes(page):
-            wrong[state] = faults
-    client.describe_case("layout")
+        for name, faults_of in ((LONG, layout_faults_at_all_sizes), ("layout", not_in_one_glance)):
+            client.describe_case(name, name, name)
+            expect(page.locator("#room")).to_have_text(re.compile(rf" {name}$"))
+            if faults := faults_of(page):
+                wrong[f"{state}, {name[:8]}"] = faults
+        page.set_viewport_size({"width": 1280, "height": 800})
+        for theme in THEMES:
+            set_theme(page, theme)
+            if found := violations(page):
+                wrong[f"{state}, {theme}"] = found
     assert not wrong
 
 

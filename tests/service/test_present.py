@@ -2,6 +2,7 @@
 
 import time
 
+import numpy as np
 import pytest
 from line_room import IMAGING, patient_mm, running_line_room
 
@@ -13,6 +14,7 @@ from service.room.context import now_of
 from service.room.present import Now, lost_since_ready, readiness, why_not_now
 from service.room.readiness import ConflictError
 from service.slicer.messages import STATUS_HEAD
+from service.slicer.pose import pose_of
 from service.slicer.scene import scene_of, standing
 
 
@@ -166,6 +168,71 @@ def test_what_changes_after_a_measurement_takes_it_back_wherever_it_is_shown(roo
     seen = standing(state)
     assert (seen.arrival, seen.reconstruction) == (None, None)
     assert (seen.measurement is not None) == (change in _ONLY_READY)
+
+
+def not_found(room):
+    def measure():
+        record = room.loop._record
+        last = record.last_measurement("done")
+        room.fiducial_visible = False
+        record.request_measurement(last.method, list(last.hold_ids), dict(last.request))
+
+    room.do(measure)
+    room.until(lambda s: s.measurement.state == "failed")
+
+
+def jog_here(room):
+    room.arm()
+    room.call("jog", axis="xt", distance_um=-700)
+    room.until(lambda s: s.procedure is None and not s.robot.moving)
+    room.later()
+
+
+def shown_pose(room):
+    """As peers are shown it; also that it is where the fiducial truly is."""
+    pose = room.do(lambda: pose_of(room.state, room.loop._record, room.config, room.loop.now))
+    if pose is not None:
+        far_mm = np.linalg.norm(pose.origin_mm - patient_mm(*room.true_plane_mm()))
+        assert far_mm < max(0.05, 5 * pose.sigma_mm)
+    return pose
+
+
+_CARRIED = {name: CHANGES[name][0] for name in CHANGES if name not in _ONLY_READY}
+_NEEDS_A_HOLD = {"other bandwidth", "other encoding direction"}
+# by others than the room, who does not record them
+_AT_THE_BRIDGE = {"move", "park", "declare", "fault", "pushed axis"}
+_CARRIED["fiducial not found"] = not_found
+_CARRIED["fiducial not found, then a bridge restart"] = lambda room: (
+    not_found(room),
+    room.stop(),
+    restart_bridge(room),
+)
+_CARRIED["stop in mid-motion"] = lambda room: (
+    room.do(lambda: setattr(room.line.stage, "speed_um_s", 500.0)),
+    room.call("jog", axis="yt", distance_um=3000),
+    room.until(lambda s: s.robot.moving),
+    room.stop(),
+)
+
+
+@pytest.mark.parametrize("change", _CARRIED)
+def test_a_pose_is_shown_while_it_is_known_and_not_longer(room, change):
+    """Carried by the room's own moves it goes on being one; whatever else happens ends it, and a
+    move after that does not bring it back.
+    """
+    room.calibrate()
+    assert shown_pose(room).measured
+    if change not in _NEEDS_A_HOLD:
+        jog_here(room)
+        assert not shown_pose(room).measured
+    _CARRIED[change](room)
+    room.later()
+    assert shown_pose(room) is None
+    if change in _AT_THE_BRIDGE or not room.state.robot.linked:
+        return
+    room.until(lambda s: not s.robot.moving and s.procedure is None)
+    jog_here(room)
+    assert shown_pose(room) is None
 
 
 @pytest.mark.parametrize("change", ["stop", "target changed", "other study", "park"])

@@ -11,6 +11,7 @@ from test_guide import approach_arguments as guide_approach
 from test_guide import calibration_arguments as guide_calibration
 
 from case_record.rows import Procedure
+from robot_bridge.protocol.phases import WorkPhase
 from service.procedure.calibration import Calibration
 from service.procedure.estimate import FiducialEstimate
 from service.procedure.jacobian import ImageJacobian
@@ -19,6 +20,7 @@ from service.procedure.registry import (
     CALIBRATION,
     GUIDE_APPROACH,
     GUIDE_CALIBRATION,
+    JOG,
     build_procedure,
 )
 from service.procedure.registry import approach_arguments as recorded_approach
@@ -89,3 +91,10 @@ def test_what_a_program_before_recorded_begins_with_the_same_step(name):
     for added in ADDED[name]:
         del told[added]
     assert first_step(name, recorded) == first_step(name, RECORDED[name])
+
+
+def test_the_phase_of_a_move_is_said_by_the_order_and_not_by_its_purpose():
+    jogged = first_step(JOG, {"setpoints_um": {"xt": 100}})
+    assert jogged.phase is WorkPhase.MANUAL
+    assert first_step(CALIBRATION, RECORDED[CALIBRATION]).phase is WorkPhase.CALIBRATION
+    assert MoveTo({"xt": 100}, "calibrated approach").phase is WorkPhase.MOVE_TO_TARGET

@@ -13,6 +13,7 @@ from datetime import datetime
 from pathlib import Path
 
 from case_record.cases import Cases
+from case_record.connection import FILE_NAME
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Event
 from service.procedure.scan_frame import CASE_REOPENED
@@ -20,6 +21,9 @@ from service.procedure.scan_frame import CASE_REOPENED
 FINISHED, REOPENED, CONTINUED = "case_finished", CASE_REOPENED, "case_continued"
 DESCRIBED = "case_described"
 CLOCK_COMPARED, CLOCK_FORGOTTEN = "clock_sync", "clock_reset"
+CLOCK_DOUBTED = "clock_doubted"
+_STILL_COUNTS_S = 3600.0
+_LOOKED_AT_CASES = 20
 QUESTION = (
     "This case was left open on another day. Is this the patient on the table? Continue the "
     "case, or finish it."
@@ -82,32 +86,57 @@ def begin(cases: Cases, room: str, by: str, words: Mapping[str, str]) -> Path:
 
     What is known of the scanner's clock is the room's, not the case's: it comes along.
     """
-    compared = _comparison(cases)
+    known = _known_of_clocks(cases)
     folder = cases.make_folder()
     with CaseRecord(folder, create=True) as record, record.transaction():
         record.start_case(room, seed=0)
         record.append_event(DESCRIBED, dict(words), source=_SOURCE, who=by)
-        if compared is not None:
-            body = {"monotonic_s": compared.monotonic_s, **compared.body}
-            record.append_event(CLOCK_COMPARED, body, source=_SOURCE, who=compared.who)
+        _bring(known, record)
     cases.set_open(folder)
     return folder
 
 
-def _comparison(cases: Cases) -> Event | None:
-    """The last comparison of the clocks in the last case, unless it was forgotten since."""
-    folders = cases.folders()
-    if not folders:
-        return None
+def _known_of_clocks(cases: Cases) -> list[Event]:
+    """What the room knows of the scanner's clock, oldest first, from the case that heard last.
+
+    Since it was compared or set last, and of the last hour in any case: of two comparisons that do
+    not agree, the later one says nothing of slices that were acquired before it.
+    """
+    newest: list[Event] = []
+    by_use = sorted(cases.folders(), key=_changed_s)
+    for folder in by_use[-_LOOKED_AT_CASES:]:
+        try:
+            with CaseRecord(folder, read_only=True) as record:
+                found = _clock_events(record)
+        except CaseRecordError:
+            continue
+        if found and (not newest or found[-1].wall_s >= newest[-1].wall_s):
+            newest = found
+    told = [event for event in newest if event.kind != CLOCK_DOUBTED]
+    if not told:
+        return newest
+    late = [event for event in newest if event.wall_s >= newest[-1].wall_s - _STILL_COUNTS_S]
+    return min(newest[newest.index(told[-1]) :], late, key=lambda events: events[0].event_id)
+
+
+def _changed_s(folder: Path) -> float:
     try:
-        with CaseRecord(folders[-1], read_only=True) as record:
-            compared = record.last_event(CLOCK_COMPARED)
-            forgotten = record.last_event(CLOCK_FORGOTTEN)
-    except CaseRecordError:
-        return None
-    if compared is None or (forgotten is not None and forgotten.seq > compared.seq):
-        return None
-    return compared
+        return (folder / FILE_NAME).stat().st_mtime
+    except OSError:  # an open case that is not there
+        return 0.0
+
+
+def _clock_events(record: CaseRecord) -> list[Event]:
+    kinds = (CLOCK_COMPARED, CLOCK_FORGOTTEN, CLOCK_DOUBTED)
+    found = [event for kind in kinds for event in record.events_of_kind(kind)]
+    return sorted(found, key=lambda event: event.event_id)
+
+
+def _bring(known: list[Event], record: CaseRecord) -> None:
+    """Into another case, each with the instants at which it was said first."""
+    for event in known:
+        body = {"monotonic_s": event.monotonic_s, "at_s": event.wall_s, **event.body}
+        record.append_event(event.kind, body, source=_SOURCE, who=event.who)
 
 
 def reopen(cases: Cases, name: str, by: str) -> Path:
@@ -116,7 +145,10 @@ def reopen(cases: Cases, name: str, by: str) -> Path:
     Where the robot stands, and what it is calibrated to, is as good as unknown then.
     """
     folder = cases.named(name)
-    with CaseRecord(folder) as record:
+    known = _known_of_clocks(cases)
+    with CaseRecord(folder) as record, record.transaction():
         record.append_event(REOPENED, {}, source=_SOURCE, who=by)
+        if known != _clock_events(record)[-len(known) :]:
+            _bring(known, record)
     cases.set_open(folder)
     return folder

@@ -12,13 +12,16 @@ import structlog
 
 from case_record.rows import Event
 from service.procedure.registry import latest_calibration
+from service.procedure.scan_frame import newest_frame
 from service.room.commands.target import TargetCommands
 from service.room.context import RoomContext
 from service.room.proposals import (
     MOST_OPEN,
     PROPOSED,
     REFUSED,
+    SCAN_FRAME,
     TAKEN,
+    WITHDRAWN,
     Plan,
     Point3,
     ProposalBook,
@@ -28,6 +31,7 @@ from service.room.proposals import (
     why_not_in_bore,
     why_other_frame,
     why_senseless,
+    why_void,
 )
 from service.room.reach import OutOfReachError, ReachUnknownError, check_reach, entry_of
 from service.room.readiness import ConflictError
@@ -46,10 +50,18 @@ class ProposalCommands:
         self._target = target
         self._book = ProposalBook()
         self._seen_event_id = -1
+        self._looked_at = (-1, -1)
 
     def look_for_plans(self) -> None:
-        """Propose what workstations have sent to the listener since the last look."""
+        """Propose what workstations have sent to the listener since the last look; withdraw what
+        the table has left.
+        """
         record = self._room.record
+        changes = record.change_count()
+        if changes == self._looked_at:
+            return
+        self._looked_at = changes
+        self._withdraw_void()
         newest = record.last_event_id()
         if newest == self._seen_event_id:
             return
@@ -63,6 +75,16 @@ class ProposalCommands:
                 self._propose_received(event)
             except (KeyError, TypeError, ValueError):  # whatever stands in it must not end the loop
                 log.exception("plan not proposed", event_id=event.event_id)
+
+    def _withdraw_void(self) -> None:
+        for one in self._book.update(self._room.record):
+            if one.state == "open" and (why := self._why_void(one.number)):
+                body = {"proposal": one.number, "sender": one.sender, "why": why}
+                self._room.note(WITHDRAWN, "", body)
+
+    def _why_void(self, number: int) -> str:
+        (proposed,) = self._room.record.events_of_kind(PROPOSED, number - 1)[:1]
+        return why_void(self._room.record, proposed)
 
     def _propose_received(self, event: Event) -> None:
         body = event.body
@@ -88,7 +110,7 @@ class ProposalCommands:
         known = self._book.update(self._room.record)
         mine = [one for one in known if one.state == "open" and _same(one, plan)]
         if mine:
-            return Verdict("proposed", _waits(mine[0]), mine[0].number, not mine[0].note)
+            return self._waiting(mine[0], reach_known=not mine[0].note)
         verdict = self._judge(plan, known)
         if verdict.code != "proposed":
             told = {"sender": plan.sender, "name": plan.name, "via": plan.via, "why": verdict.text}
@@ -96,9 +118,16 @@ class ProposalCommands:
             return verdict
         note = "" if verdict.reach_known else verdict.text
         body = {**_as_json(plan), "note": note, "received": received}
+        if (frame := newest_frame(self._room.record)) is not None:
+            body[SCAN_FRAME] = frame.to_json()
         self._room.note(PROPOSED, by, body)
         new = self._book.update(self._room.record)[-1]
-        return Verdict("proposed", _waits(new), new.number, verdict.reach_known)
+        return self._waiting(new, reach_known=verdict.reach_known)
+
+    def _waiting(self, one: ProposalState, *, reach_known: bool) -> Verdict:
+        case = self._room.record.case()
+        case_uid = "" if case is None else case.case_uid
+        return Verdict("proposed", _waits(one), one.number, reach_known, case_uid)
 
     def _judge(self, plan: Plan, known: list[ProposalState]) -> Verdict:
         why = why_senseless(plan) or why_other_frame(
@@ -128,10 +157,11 @@ class ProposalCommands:
         one = self._open(number)
         room = self._room
         plan = Plan(one.sender, one.name, one.via, one.target_mm, one.entry_mm, one.direction)
-        why = why_other_frame(one.frame_of_reference_uid, frame_of_reference(room.record))
+        why = why_other_frame(
+            one.frame_of_reference_uid, frame_of_reference(room.record)
+        ) or self._why_void(number)
         if why:
             raise ConflictError("other_frame", f"Not accepted: {why}.")
-        entry_mm = one.entry_mm
         try:
             if plan.target_mm is not None:
                 check_reach(room, plan, in_water=in_water)
@@ -139,16 +169,30 @@ class ProposalCommands:
             raise ConflictError("out_of_reach", f"Not accepted: {error}.") from error
         except ReachUnknownError:
             pass  # an approach asks again before anything moves
-        guide = room.config.service.guide
-        calibration = latest_calibration(room.record, guide=guide is not None)
-        if entry_mm is None and one.direction is not None and guide and calibration:
-            entry_mm = entry_of(room, plan, calibration)
+        entry_mm = self._entry_of(plan)
         with room.record.transaction():
             if entry_mm is not None:
                 self._target.set_entry(entry_mm, by)
             if one.target_mm is not None:
                 self._target.set_target(one.target_mm, by, label or one.name, in_water)
             room.note(TAKEN, by, {"proposal": number, "sender": one.sender, "in_water": in_water})
+
+    def _entry_of(self, plan: Plan) -> Point3 | None:
+        """The plan's own, or what its direction says where a guide has one."""
+        room = self._room
+        if plan.entry_mm is not None or plan.direction is None or not room.config.service.guide:
+            return plan.entry_mm
+        calibration = latest_calibration(room.record, guide=True)
+        if calibration is None:
+            raise ConflictError(
+                "not_calibrated",
+                "Not accepted: the direction that it proposes can be used only once the guide is "
+                "calibrated. Calibrate first.",
+            )
+        try:
+            return entry_of(room, plan, calibration)
+        except (OutOfReachError, ReachUnknownError) as error:
+            raise ConflictError("out_of_reach", f"Not accepted: {error}.") from error
 
     def refuse_proposal(self, number: int, by: str, why: str = "") -> None:
         """Say no; the sender is told why."""

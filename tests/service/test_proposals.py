@@ -1,0 +1,146 @@
+"""Proposals and the room they were made for: another table, another case, another sender."""
+
+import asyncio
+import threading
+from contextlib import contextmanager
+
+import pytest
+from line_room import patient_mm, running_line_room
+from openigtlink_station import station
+
+from case_record.cases import Cases
+from dicom_listener.belonging import ACCEPTED, BOUND, event_body
+from dicom_slice.patient import Identity
+from service.room.proposals import Plan
+from service.room.readiness import ConflictError
+from service.slicer.server import OpenIgtLinkServer, bind_openigtlink
+
+INWARDS = "[openigtlink]\nport = 0\ninwards = true\n"
+GUIDE = """
+[service.guide]
+upper_plane_mm = 58.0
+lower_plane_mm = -2.0
+upper_fiducial_mm = 48.0
+lower_fiducial_mm = 14.0
+upper_slice_mm = 46.0
+lower_slice_mm = 12.0
+"""
+PLAN = Plan("workstation", "L4", "OpenIGTLink", patient_mm(41.0, 58.0), (58.0, -50.0, -41.0))
+
+
+def bind(room, kind, frame, study="1.2.3"):
+    body = event_body(Identity("p", study, frame))
+    room.do(lambda: room.loop._record.append_event(kind, body, source="listener"))
+
+
+MOVED = {
+    "a study with another frame is accepted": lambda room: bind(room, ACCEPTED, "1.2.8", "1.2.4"),
+    "a slice of another frame": lambda room: room.receive(frame_of_reference_uid="1.2.8"),
+    "a slice of another study": lambda room: room.receive(study_instance_uid="1.2.2"),
+}
+
+
+@pytest.mark.parametrize("moved", MOVED)
+def test_a_proposal_does_not_survive_a_table_that_may_have_moved(tmp_path, moved):
+    """Also where it does not say its frame of reference."""
+    with running_line_room(tmp_path) as room:
+        room.calibrate()
+        bind(room, BOUND, "1.2.9")
+        number = room.call("propose", plan=PLAN).number
+        assert room.until(lambda s: s.proposals).proposals[-1].state == "open"
+        MOVED[moved](room)
+        (one,) = room.until(lambda s: s.proposals[-1].state != "open").proposals
+        assert (one.state, one.by) == ("withdrawn", "")
+        assert "plan it again" in one.reason
+        with pytest.raises(ConflictError):
+            room.call("take_proposal", number=number, in_water=False)
+        assert room.later().target_patient_mm is None
+        # what is proposed from now on is for the table as it lies now
+        assert room.call("propose", plan=PLAN).number > number
+
+
+def test_a_proposal_stays_open_while_nothing_moves(tmp_path):
+    with running_line_room(tmp_path) as room:
+        number = room.call("propose", plan=PLAN).number
+        bind(room, BOUND, "1.2.9")
+        room.calibrate()
+        room.receive()
+        assert room.later().proposals[-1].state == "open"
+        room.call("refuse_proposal", number=number, why="no")
+
+
+def test_a_direction_that_cannot_be_used_yet_is_not_accepted(tmp_path):
+    plan = Plan("station", "TGT_1", "OpenIGTLink", (10.0, 20.0, 30.0), None, (0.0, -1.0, 0.0))
+    with running_line_room(tmp_path, GUIDE) as room:
+        room.call("set_entry", patient_mm=(50.0, -60.0, 0.0))
+        number = room.call("propose", plan=plan).number
+        with pytest.raises(ConflictError, match="Calibrate first"):
+            room.call("take_proposal", number=number, in_water=False)
+        state = room.later()
+        assert state.target_patient_mm is None
+        assert state.proposals[-1].state == "open"
+
+
+@contextmanager
+def served(room):
+    """The port at which peers are heard."""
+    listening = bind_openigtlink(room.config.openigtlink)
+    port, started, over = listening.getsockname()[1], threading.Event(), threading.Event()
+
+    async def serve():
+        cases = Cases(*room.config.room.folders)
+        server = OpenIgtLinkServer(room.config, cases, room.loop, listening)
+        await server.start()
+        started.set()
+        await asyncio.to_thread(over.wait)
+        while server.receivers:
+            await asyncio.sleep(0.01)
+        await server.close()
+
+    thread = threading.Thread(target=asyncio.run, args=(serve(),))
+    thread.start()
+    try:
+        assert started.wait(10)
+        yield port
+    finally:
+        over.set()
+        thread.join()
+
+
+def about_plans(message):
+    return message["device"] == "TARGET"
+
+
+def propose(peer):
+    since = peer.mark()
+    peer.say("point", "Plan", "ENTRY", "10 20 60", "TARGET", "10 20 30")
+    assert peer.wait_for(about_plans, since)["name"] == "proposed"
+
+
+def test_a_sender_is_told_of_its_own_proposal_and_of_its_end_with_the_case(tmp_path):
+    """The numbers begin anew with each case: the second's has the number of the first's."""
+    with (
+        running_line_room(tmp_path, INWARDS, many_cases=True) as room,
+        served(room) as port,
+        station("own", port) as first,
+        station("own", port) as second,
+    ):
+        room.call("begin_case", label="anna", operator="", note="")
+        propose(first)
+        (before,) = room.until(lambda s: s.proposals).proposals
+        first.next_beats()
+        since = first.mark()
+        room.call("finish_case")
+        told = first.wait_for(about_plans, since)
+        assert (told["code"], told["name"]) == (5, "withdrawn")
+        assert "its case has ended" in told["text"]
+
+        room.call("begin_case", label="berta", operator="", note="")
+        propose(second)
+        (now,) = room.until(lambda s: s.proposals).proposals
+        assert now.number == before.number
+        since, since_second = first.mark(), second.mark()
+        room.call("take_proposal", number=now.number, in_water=False)
+        assert second.wait_for(about_plans, since_second)["name"] == "taken"
+        first.next_beats()
+        assert not [one for one in first.heard[since:] if about_plans(one)]
