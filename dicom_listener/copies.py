@@ -53,7 +53,7 @@ def what_it_is(
 
 def _without_encoding(header: Mapping[str, Any]) -> dict[str, Any]:
     """As the record gives it back: tuples are lists there."""
-    beside = (*_OF_THE_ENCODING, "envelope")
+    beside = (*_OF_THE_ENCODING, "envelope", "heeded_event")
     kept = {name: value for name, value in header.items() if name not in beside}
     plain: dict[str, Any] = json.loads(json.dumps(kept))
     return plain

@@ -6,9 +6,11 @@ size, for its acquisition had ended by then. The share itself is only read. What
 remembered by its hash, so that a restart takes nothing twice.
 """
 
+import errno
 import io
 import math
 import os
+import stat
 import struct
 import threading
 import time
@@ -23,7 +25,7 @@ import structlog
 from pydicom import dcmread
 from pydicom.dataset import FileDataset
 
-from dicom_listener.inbox import Envelope, Inbox, InboxError, sha256_of
+from dicom_listener.inbox import Envelope, Inbox, sha256_of
 from dicom_slice.quirks import MR_CLASSES
 
 SENDER = "watch_dir"
@@ -79,6 +81,7 @@ class DropFolder:
         self._unfinished_alarm_s = unfinished_alarm_s
         self._seen: dict[str, Seen] = {}
         self._done: dict[str, tuple[int, int]] = {}  # name: size and change of what is dealt with
+        self._troubled: set[str] = set()  # that could not be taken, and were reported
         self._is_there = True
         self._looked_s = -math.inf  # when the last look began that saw the folder, monotonic
         self._stopped = threading.Event()
@@ -115,6 +118,7 @@ class DropFolder:
         self._is_there = True
         for name in self._seen.keys() - found.keys():
             del self._seen[name]
+            self._troubled.discard(name)
         for name, (size, changed_ns) in found.items():
             if self._done.get(name) != (size, changed_ns):
                 self._consider(name, size, changed_ns)
@@ -131,7 +135,9 @@ class DropFolder:
                 path = Path(folder) / name
                 try:
                     status = path.stat()
-                except FileNotFoundError:  # renamed in this moment
+                except OSError:  # renamed in this moment, a link to nowhere, or locked
+                    continue
+                if not stat.S_ISREG(status.st_mode):  # reading a pipe would wait for ever
                     continue
                 yield str(path.relative_to(self._folder)), (status.st_size, status.st_mtime_ns)
 
@@ -153,10 +159,13 @@ class DropFolder:
                     return
                 text = f"{name}: incomplete for {still_s:.0f} s ({error}); it is not used"
                 self._alarm("watch_dir_refused", text)
-            except OSError as error:
-                self._alarm("watch_dir_refused", f"{name}: {error.strerror or error}")
-                if isinstance(error, InboxError):  # there is no room for it now
-                    return
+            except OSError as error:  # locked by the console, or no room: it may go in a while
+                if name not in self._troubled:
+                    self._troubled.add(name)
+                    text = f"{name}: {error.strerror or error}; it is tried again"
+                    self._alarm("watch_dir_refused", text)
+                return
+        self._troubled.discard(name)
         self._done[name] = size, changed_ns
         del self._seen[name]
 
@@ -167,7 +176,7 @@ class DropFolder:
         return Seen(size, changed_ns, now_s, now_monotonic_s, is_fresh)
 
     def _take(self, name: str, seen: Seen) -> None:
-        raw = (self._folder / name).read_bytes()
+        raw = self._read(name)
         data_set, body = whole_file(raw)
         digest = sha256_of(body)
         if digest in self._taken:
@@ -191,6 +200,14 @@ class DropFolder:
         with self._taken_file.open("a") as file:
             file.write(digest + "\n")
         self._on_stored(path)
+
+    def _read(self, name: str) -> bytes:
+        """A file that has become a pipe since it was looked at must not keep the thread either."""
+        descriptor = os.open(self._folder / name, os.O_RDONLY | os.O_NONBLOCK)
+        with open(descriptor, "rb") as file:
+            if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+                raise OSError(errno.EINVAL, "no regular file")
+            return file.read()
 
     def _alarm(self, kind: str, text: str) -> None:
         self.alarms.append((kind, text))

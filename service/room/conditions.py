@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import os
+from pathlib import Path
+
 from robot_bridge.protocol.phases import WorkPhase
-from service.room.alarms import Condition
+from service.room.alarms import TO_DO, Condition
 from service.room.prompt import plain_words
 from service.room.state import RoomState
 
@@ -83,3 +86,18 @@ def conditions(state: RoomState) -> list[Condition]:
         text = f"Measurement failed: {state.measurement.reason}"
         found.append(Condition("measurement", "warning", text, "Acquire the slice again."))
     return found
+
+
+def disk_refuses(case_dir: Path, min_free_mib: int) -> list[Condition]:
+    """A disk on which the listener can store no slice; an alarm of its own could not be recorded.
+
+    Raises OSError if the folder is gone.
+    """
+    disk = os.statvfs(case_dir)
+    if disk.f_flag & os.ST_RDONLY:
+        text = "The case's disk is read-only: slices are refused"
+    elif disk.f_bavail * disk.f_frsize < min_free_mib * 2**20:
+        text = f"The case's disk has less than {min_free_mib} MiB free: slices are refused"
+    else:
+        return []
+    return [Condition("disk_refuses", "alarm", text, TO_DO["disk_low"])]

@@ -24,7 +24,7 @@ from service.room.belief.goal import effective, goal_tolerance_mm
 from service.room.belief.state import BeliefState
 from service.room.cases.held import HeldSlices, arriving
 from service.room.cases.life import QUESTION, CaseLife
-from service.room.conditions import HANGS, conditions
+from service.room.conditions import HANGS, conditions, disk_refuses
 from service.room.context import now_of
 from service.room.execution import Execution
 from service.room.history import arrival_by_hand, rests_on_slices
@@ -139,6 +139,7 @@ class Describer:
         other = _other(record, state.other_fiducial, now)
         state = state.model_copy(update={"other_fiducial": other})
         wrong = [*conditions(state), *clock_was_set(config, record), *arriving(record)]
+        wrong += disk_refuses(record.case_dir, config.listener.min_free_mib)
         wrong += self._others_wrong()
         alarms = self._alarms.update(wrong, record)
         state = state.model_copy(update={"alarms": alarms})

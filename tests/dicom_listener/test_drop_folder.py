@@ -1,5 +1,6 @@
 """Slices by a shared folder: the same inbox and the same proofs as what comes by C-STORE."""
 
+import errno
 import os
 import time
 from pathlib import Path
@@ -87,6 +88,33 @@ def test_only_a_file_that_appears_while_the_folder_is_watched_is_fresh(tmp_path,
     watching.look()
     assert not read_envelope(watching.stored[-1])[0].is_fresh
     assert len(watching.stored) == 4
+
+
+def test_a_file_that_cannot_be_read_yet_is_taken_once_it_can(tmp_path, watching, monkeypatch):
+    (watching.share / "a.dcm").write_bytes(file_bytes(tmp_path, "1.2.3"))
+    plain = os.open
+
+    def locked(path, *rest, **more):
+        if Path(path).name == "a.dcm":
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return plain(path, *rest, **more)
+
+    with monkeypatch.context() as lock:  # root may read what is locked: as a share would refuse it
+        lock.setattr(os, "open", locked)
+        watching.look(5)
+    assert watching.kinds == ["watch_dir_refused"]  # once
+    watching.look(1)
+    assert len(watching.stored) == 1
+
+
+def test_links_to_nowhere_and_pipes_keep_nothing_from_being_taken(tmp_path, watching):
+    (watching.share / "loop").symlink_to("loop")
+    (watching.share / "dangling").symlink_to("nothing")
+    os.mkfifo(watching.share / "pipe")
+    (watching.share / "a.dcm").write_bytes(file_bytes(tmp_path, "1.2.3"))
+    watching.look(3)
+    assert len(watching.stored) == 1
+    assert watching.kinds == []
 
 
 def test_a_file_that_is_being_written_is_taken_when_it_is_whole(tmp_path, watching):

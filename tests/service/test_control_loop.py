@@ -1,5 +1,6 @@
 """The control loop under faults: what fails ends alone, and a record in trouble ends nothing."""
 
+import contextlib
 import sqlite3
 import time
 from collections.abc import Callable, Iterator
@@ -11,6 +12,7 @@ from lone_service import CONFIG
 
 from case_record.record import FILE_NAME, CaseRecord
 from room_config.load import load_config
+from service.room.conditions import disk_refuses
 from service.room.control import STALE_S, ControlLoop
 from service.room.link import PumpedClient, RoomLink
 from service.room.readiness import ConflictError
@@ -51,6 +53,21 @@ def locked(case_dir: Path) -> Iterator[None]:
 
 def is_unusable(state: RoomState) -> bool:
     return any(alarm.code == "record_unusable" for alarm in state.alarms)
+
+
+def test_a_disk_on_which_no_slice_can_be_stored_is_an_alarm_of_the_service(tmp_path):
+    """The listener, who notices first, can record no alarm there."""
+    assert disk_refuses(tmp_path, 1) == []
+    with pytest.raises(OSError, match="gone"):  # the loop holds then, as without a record
+        disk_refuses(tmp_path / "gone", 1)
+    listener = f"\n[listener]\nport = 0\nmin_free_mib = {10**9}\n"
+    (tmp_path / "room.toml").write_text(CONFIG.split("[listener]")[0] + listener)
+    config = load_config(tmp_path / "room.toml", {})
+    client = PumpedClient(config.service.bridge_link, name="service")
+    with contextlib.closing(ControlLoop(config, RoomLink(client, lambda text: None))) as loop:
+        loop.start()
+        state = wait_for_state(loop, lambda s: s.case_uid)
+        assert "slices are refused" in {a.code: a.text for a in state.alarms}["disk_refuses"]
 
 
 def describe(loop: ControlLoop) -> None:
