@@ -124,8 +124,11 @@ class EmulatedBus:
             self.faults.garble_commands = max(0, self.faults.garble_commands - 1)
             line = self._with_wrong_bit(line)
         matched = re.fullmatch(rb"X(\d{0,3})(~?)([\x20-\x7e]*)", line)
-        if not matched:
-            return  # another device's chatter
+        if not matched:  # another device's chatter, or a line that lacks its X
+            if delimiter == SEMICOLON:
+                for controller in self.controllers:
+                    status_error(controller)
+            return
         address = int(matched[1] or b"0")
         shown = f"X{matched[1].decode()}"
         body = matched[3].decode()

@@ -53,6 +53,15 @@ def test_semicolons_run_silently_and_errors_only_show_in_the_status():
     assert status(bench, 2) & Status.COMMAND_ERROR
 
 
+def test_a_line_without_its_x_is_done_by_nobody_and_shows_in_the_status():
+    bench = Bench((2,))
+    status(bench, 2)
+    before = bench.say(b"X2Y4\r")
+    assert bench.say(b"2Y4,0;") == b""
+    assert bench.say(b"X2Y4\r") == before
+    assert status(bench, 2) & Status.COMMAND_ERROR
+
+
 def test_a_stop_with_rubbish_behind_it_is_still_a_stop():
     bench = unparked(Bench((1,)))
     bench.say(b"X1J1000,0,100\r")
