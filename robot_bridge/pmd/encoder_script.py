@@ -9,6 +9,7 @@ from robot_bridge.pmd.axis import PmdAxis
 from robot_bridge.pmd.controller import POLL_PAUSE_S, Steps
 from robot_bridge.pmd.line import Pause
 from robot_bridge.pmd.protocol import Command
+from robot_bridge.pmd.setup import verify
 
 SCRIPT_STEPS = 16
 SCRIPT_DEADLINE_S = 6.0
@@ -28,6 +29,7 @@ def find_encoder(axis: PmdAxis) -> Steps[EncoderFound]:
 
     The axis has to be set up again afterwards: its gain is the script's.
     """
+    yield from verify(axis)
     yield from axis.unpark()
     axis.needs_setup = True
     axis.at_rest_um = None

@@ -15,17 +15,19 @@ from robot_bridge.pmd.controller import AxisFaultError, Steps
 from robot_bridge.pmd.line import Procedure
 from robot_bridge.pmd.progress import FOLLOWS, agrees, disagreement
 from robot_bridge.pmd.protocol import Command
+from robot_bridge.pmd.setup import verify
 from robot_bridge.pmd.status import Inputs
 
 CHUNK_UM = 2000.0  # of a run towards a mechanical end, between two looks at the encoder
 BACK_OFF_UM, PULL_OFF_UM = 1000.0, 500.0
 STANDS = 0.2  # of the way that the motor's steps should make
-INDEX_LATCHED, INDEX_SEARCH = 1, 4
+INDEX_OFF, INDEX_LATCHED, INDEX_SEARCH = 0, 1, 4
 
 
 def home(axis: PmdAxis, home_um: int) -> Procedure:
     """Find the place that is called `home_um`, and declare it."""
     axis.fault = None
+    yield from verify(axis)
     yield from axis.unpark()
     axis.certain = False
     axis.proven = False
@@ -187,6 +189,8 @@ def _home_to_index(axis: PmdAxis, home_um: int) -> Steps[None]:
             offset = pmd_units.count_from_um(axis.config, home_um)
             yield from axis.declare_count(count + offset)
             return
+        # else the next run would end at the index, and its count begin anew there
+        yield Command(axis.address, f"N{INDEX_OFF}", reads=False)
         yield from _expect_any_motion(axis, from_um)
     raise _cannot(axis, "the encoder's index was not found in either direction")
 

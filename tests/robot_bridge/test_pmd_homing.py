@@ -61,6 +61,28 @@ def test_the_index_of_an_encoder_is_found_and_left_behind_in_the_count():
         assert made.position_um(1) == pytest.approx(1500, abs=2)
 
 
+def test_a_board_that_came_to_the_axis_by_a_swapped_cable_is_not_homed():
+    """Nothing dropped out: only the serial number tells."""
+    with rig(stage=StageWithEnds) as made, opened(made, "closed_loop", declare=False) as motors:
+        with made.lock:
+            made.controller(1).motor = Motor(serial_number=77)
+        motors.home(["xt"])
+        assert finish(motors).fault == "wrong_board"
+        assert made.runs() == 0
+
+
+def test_an_index_that_was_not_found_leaves_no_run_that_ends_at_it():
+    motor = Motor(index_um=50_000.0)
+    changes = {"home_um": 0, "home_to": "index"}
+    with (
+        rig(stage=StageWithEnds, motor=motor) as made,
+        opened(made, "closed_loop", declare=False, **changes) as motors,
+    ):
+        motors.home(["xt"])
+        assert finish(motors).fault == "cannot_home"
+        assert made.controller(1).index_mode == 0
+
+
 def refused(motors, why: str) -> None:
     status = finish(motors)
     assert status.fault == "cannot_home"
