@@ -23,10 +23,10 @@ $(VENV)/.dev: requirements-dev.lock $(VENV)/.runtime
 demo: $(VENV)/.runtime
 	$(BIN)/autospine demo $(ARGS)
 
-# Two workers a core: what starts processes mostly waits for them.
+# More workers (make test WORKERS=4) are quicker on an idle machine: what starts processes mostly waits.
 test: $(VENV)/.dev
 	sh tests/system_packages.sh
-	$(BIN)/python -m pytest -n $(or $(WORKERS),4) --dist loadfile --no-loadscope-reorder $(ARGS)
+	$(BIN)/python -m pytest -n $(or $(WORKERS),2) --dist loadfile --no-loadscope-reorder $(ARGS)
 
 # The pure tests: no processes, no browser.
 quick: $(VENV)/.dev

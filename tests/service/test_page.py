@@ -62,6 +62,8 @@ def test_a_whole_case_from_calibration_to_the_needle_out_by_clicking(
     page: Page, client: RoomClient
 ) -> None:
     ready_to_calibrate(page, client)
+    if client.state().target_patient_mm is not None:  # of a test before
+        client.withdraw_target()
     button(page, "Start the calibration")
     # what will move, and how far, is said before it does
     expect(page.locator("#actions")).to_contain_text("xt: ")
