@@ -218,13 +218,17 @@ def view_of(record: CaseRecord, number: int) -> View:
     row = record.measurement(number)
     if row.result is None:
         raise TemplateError(f"measurement {number}, of which the template is learnt, has no result")
-    frames = frames_then(gather_frames(record, row), row)
+    set_aside = UnusableSlicesError(
+        "no_slices",
+        f"a slice of measurement {number}, of which the template is learnt, was set aside "
+        "since: calibrate again",
+    )
+    try:
+        frames = frames_then(gather_frames(record, row), row)
+    except UnusableSlicesError as error:
+        raise set_aside if error.code == "no_slices" else error from None
     if len(frames.slices) != len(row.result["slice_ids"]):
-        raise UnusableSlicesError(
-            "no_slices",
-            f"a slice of measurement {number}, of which the template is learnt, was set aside "
-            "since: calibrate again",
-        )
+        raise set_aside
     return View(number, frames, np.array(row.result["reference_px"]))
 
 
