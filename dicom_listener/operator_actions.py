@@ -13,6 +13,7 @@ import numpy as np
 
 from case_record.record import CaseRecord
 from case_record.rows import Hold, SliceRow
+from dicom_listener.scanner_clocks import CLOCK_COMPARED, CLOCK_FORGOTTEN
 from dicom_slice.geometry import SliceGeometry
 from dicom_slice.reasons import Reason
 
@@ -57,12 +58,12 @@ def reassign(record: CaseRecord, slice_id: int, hold_id: int | None, who: str, w
 def sync_clock(record: CaseRecord, offset_s: float, uncertainty_s: float, who: str) -> None:
     """The two clocks were compared now: offset_s is ours minus the scanner's."""
     body = {"offset_s": offset_s, "uncertainty_s": uncertainty_s, "at_s": time.time()}
-    record.append_event("clock_sync", body, source=_SOURCE, who=who)
+    record.append_event(CLOCK_COMPARED, body, source=_SOURCE, who=who)
 
 
 def reset_clock(record: CaseRecord, who: str, why: str = "") -> None:
     """The scanner's clock was set: forget what was known of it, until the clocks are compared."""
-    record.append_event("clock_reset", {"why": why}, source=_SOURCE, who=who)
+    record.append_event(CLOCK_FORGOTTEN, {"why": why}, source=_SOURCE, who=who)
 
 
 def give_up_slices(record: CaseRecord, hold_id: int, who: str, why: str) -> int:

@@ -18,7 +18,8 @@ from dicom_listener.clock import (
 )
 from dicom_slice.header import Slice
 
-CLOCK_DOUBTED = "clock_doubted"
+# kinds of events: by people, by people, by slices
+CLOCK_COMPARED, CLOCK_FORGOTTEN, CLOCK_DOUBTED = "clock_sync", "clock_reset", "clock_doubted"
 _WHAT_TO_DO = {
     kind: "; compare the clocks"
     for kind in ("clock_jump", "late_or_clock_jump", "push_delay_unlike_measured", "clock_drift")
@@ -134,14 +135,14 @@ class ScannerClocks:
 
     def heed(self, kind: str, body: Mapping[str, Any], wall_s: float) -> None:
         """Follow an event of the record, where it concerns clocks."""
-        if kind == "clock_sync":
+        if kind == CLOCK_COMPARED:
             made = Comparison(body["offset_s"], body["uncertainty_s"], body["at_s"])
             self._unseen = self._with_filed(self._unseen.compared(made, self._rules), made.at_s)
             self._clocks = {
                 name: self._with_filed(clock.compared(made, self._rules), made.at_s)
                 for name, clock in self._clocks.items()
             }
-        elif kind == "clock_reset":
+        elif kind == CLOCK_FORGOTTEN:
             set_at_s = body.get("at_s", wall_s)  # what was said in an earlier case has an instant
             self._unseen = self._with_filed(ScannerClock(set_at_s=set_at_s), set_at_s)
             self._clocks.clear()

@@ -14,9 +14,9 @@ order (`seq`), never by a clock that somebody may set.
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -119,24 +119,23 @@ def rests_on(record: CaseRecord, status: BridgeStatus) -> dict[str, Any]:
 
 def why_not_now(record: CaseRecord, measurement: Measurement, now: Now) -> Lost | None:
     """Return why a finished measurement does not say any more where the fiducial is, or None."""
-    if record.doubt:
-        return Lost("record_changed", record.doubt)
-    facts = measurement.request.get(RESTS_ON)
-    if facts is None:
-        return Lost("unknown", "it is unknown what the measurement relies on")
-    return (
-        _case_ended(record, measurement)
-        or _robot_changed(facts, now)
-        or _scanner_changed(record, measurement)
-        or _too_old(facts, now)
-        or _measured_again(record, measurement)
-    )
+    return _why_not(record, measurement, now, _robot_changed)
 
 
 def why_not_carried(record: CaseRecord, measurement: Measurement, now: Now) -> Lost | None:
     """Return why the fiducial is not where the robot's moves since a finished measurement have
     carried it, or None: as `why_not_now`, but for the moves that this case ordered.
     """
+    return _why_not(record, measurement, now, partial(_moved_otherwise, record, measurement))
+
+
+def _why_not(
+    record: CaseRecord,
+    measurement: Measurement,
+    now: Now,
+    robot_changed: Callable[[Mapping[str, Any], Now], Lost | None],
+) -> Lost | None:
+    """robot_changed: what counts as a change of the robot, by what the measurement rests on."""
     if record.doubt:
         return Lost("record_changed", record.doubt)
     facts = measurement.request.get(RESTS_ON)
@@ -144,7 +143,7 @@ def why_not_carried(record: CaseRecord, measurement: Measurement, now: Now) -> L
         return Lost("unknown", "it is unknown what the measurement relies on")
     return (
         _case_ended(record, measurement)
-        or _moved_otherwise(record, measurement, facts, now)
+        or robot_changed(facts, now)
         or _scanner_changed(record, measurement)
         or _too_old(facts, now)
         or _measured_again(record, measurement)

@@ -15,12 +15,12 @@ from typing import Any
 from case_record.record import CaseRecord
 from case_record.rows import Event, Hold
 from dicom_listener.clock import ClockRules
+from dicom_listener.scanner_clocks import CLOCK_COMPARED, CLOCK_FORGOTTEN
 from room_config.load import Config
 from service.room.alarms import Condition
 from service.room.present import computer_start
 from service.room.state import ClockState
 
-CLOCK_COMPARED, CLOCK_FORGOTTEN = "clock_sync", "clock_reset"
 # by less the margins between a hold and its slices allow for
 _STEP_S = 0.1
 _WAITS = "slices are pending: compare the clocks, or confirm the hold at which each was acquired"
@@ -73,8 +73,8 @@ def _made_s(compared: ClockState) -> float:
 
 
 def _last_comparison(config: Config, record: CaseRecord) -> ClockState | None:
-    compared = record.last_event("clock_sync")
-    forgotten = record.last_event("clock_reset")
+    compared = record.last_event(CLOCK_COMPARED)
+    forgotten = record.last_event(CLOCK_FORGOTTEN)
     if forgotten is not None and (compared is None or compared.event_id < forgotten.event_id):
         return None
     return _from_file(config) if compared is None else _from_event(compared)

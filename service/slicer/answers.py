@@ -39,7 +39,6 @@ from service.slicer.reading import (
     points_of,
     string_of,
 )
-from service.slicer.reading import stop_word as stop_word
 from service.slicer.scene import axes_along, code_of, status_of
 
 Array = NDArray[np.float64]

@@ -8,10 +8,10 @@ import pytest
 from robot_bridge.protocol.phases import WorkPhase
 from service.room.proposals import Verdict
 from service.room.state import RobotState, RoomState
-from service.slicer.answers import acknowledge, answer, decision_of, stop_word, verdict_of
+from service.slicer.answers import acknowledge, answer, decision_of, verdict_of
 from service.slicer.messages import Message, Point, points, string, transform
 from service.slicer.pose import Pose
-from service.slicer.reading import Received, Stream, matrix_of, string_of
+from service.slicer.reading import Received, Stream, matrix_of, stop_word, string_of
 
 ROBOT = RobotState(linked=True, armed=True, position_certain=True, phase="PLANNING")
 STATES = {

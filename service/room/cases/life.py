@@ -16,12 +16,11 @@ from case_record.cases import Cases
 from case_record.connection import FILE_NAME
 from case_record.record import CaseRecord, CaseRecordError
 from case_record.rows import Event
+from dicom_listener.scanner_clocks import CLOCK_COMPARED, CLOCK_DOUBTED, CLOCK_FORGOTTEN
 from service.procedure.scan_frame import CASE_REOPENED
 
 FINISHED, REOPENED, CONTINUED = "case_finished", CASE_REOPENED, "case_continued"
 DESCRIBED = "case_described"
-CLOCK_COMPARED, CLOCK_FORGOTTEN = "clock_sync", "clock_reset"
-CLOCK_DOUBTED = "clock_doubted"
 _STILL_COUNTS_S = 3600.0
 _LOOKED_AT_CASES = 20
 QUESTION = (

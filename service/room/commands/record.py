@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 
 from dicom_listener.operator_actions import give_up_slices, reassign, reset_clock, why_not_by_hand
+from dicom_listener.scanner_clocks import CLOCK_COMPARED
 from service.room.context import RoomContext
 from service.room.readiness import ConflictError
 
@@ -54,7 +55,7 @@ class RecordCommands:
     def compare_clocks(self, by: str, offset_s: float, uncertainty_s: float) -> None:
         """The room's clock minus the scanner's, compared just now; the listener heeds the event."""
         body = {"offset_s": offset_s, "uncertainty_s": uncertainty_s, "at_s": time.time()}
-        self._room.note("clock_sync", by, body)
+        self._room.note(CLOCK_COMPARED, by, body)
 
     def forget_clock(self, why: str, by: str) -> None:
         """The scanner's clock was set, or seemed to be: slices wait for the next comparison."""
