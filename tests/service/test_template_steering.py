@@ -7,6 +7,7 @@ import pytest
 from offline_arguments import GATE, approach_arguments, beside, calibration_arguments
 
 from case_record.record import CaseRecord
+from dicom_listener.operator_actions import reassign
 from service.cli.replay import replay_measurements, replay_procedure
 from service.procedure.approach import approach
 from service.procedure.calibration import BY_DISC, FoundBy, calibrate
@@ -20,6 +21,7 @@ from service.procedure.targets import Target, common_part_mm
 from simulator.config import CANNULATED, Fiducial, SliceProtocol, VirtualRoom
 from simulator.stage_physics import StageParameters
 from sr_engine.errors import TemplateError
+from sr_engine.request import UnusableSlicesError
 from sr_engine.views import Templates
 from sr_engine.worker import view_of
 from studies.offline_room import MrImaging, OfflineRoom
@@ -119,6 +121,16 @@ def test_slices_of_another_protocol_are_not_fitted_by_it_and_said_to_be(recorded
     assert "calibrate again" in result["why_no_template"]
     # what disc and template mean by the middle may differ: that is in its covariance
     assert np.all(np.diag(seen.covariance_mm2) > np.square(start.found_by.systematic_mm))
+
+
+def test_a_template_that_lacks_a_slice_since_says_which_measurement_and_what_to_do(recorded):
+    recorded.run_recorded(CALIBRATION, recorded_calibration(calibration_arguments()))
+    row = recorded.record.measurements("done")[0]
+    for slice_id in row.result["slice_ids"]:
+        reassign(recorded.record, slice_id, None, "Olga", "a doubtful one")
+    why = f"measurement {row.measurement_id}, .* was set aside since: calibrate again"
+    with pytest.raises(UnusableSlicesError, match=why):
+        view_of(recorded.record, row.measurement_id)
 
 
 def test_a_cameras_images_make_no_template(recorded):
