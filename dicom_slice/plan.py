@@ -47,7 +47,7 @@ class OnImage:
 @dataclass(frozen=True)
 class PlanPoint:
     """label: TARGET or ENTRY; patient_mm with its frame of reference, or else on_image, or else why
-    it has no place. images: where the frame of reference is not said, the UIDs of those whose it is.
+    it has no place. images: without a frame of reference, the UIDs of those whose it is.
     """
 
     label: str
