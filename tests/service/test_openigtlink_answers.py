@@ -245,12 +245,13 @@ def test_what_is_not_for_the_robot_is_not_answered():
 
 
 def test_a_flood_is_told_that_it_is_too_many_under_the_name_of_what_it_sent():
-    names = {TGT: "TARGET", listed(): "TARGET", transform("CLB_", 1.0, np.eye(3), (0, 0, 0)): ""}
-    for message, name in names.items():
+    registration = transform("CLB_", 1.0, np.eye(3), (0, 0, 0))
+    flood = ((TGT, "TARGET"), (listed(), "TARGET"), (registration, "CALIBRATION"))
+    for message, name in flood:
         assert concerns_us(received(message))
         told = not_looked_at(received(message), 1.0)
         assert code_of(told)[0] == 13
-        assert told.device == (name or "CALIBRATION")
+        assert told.device == name
         assert b"too_many" in told.content
 
 

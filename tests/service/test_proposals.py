@@ -292,7 +292,7 @@ def test_both_halves_of_a_plan_are_answered_as_one(tmp_path):
         served(room) as port,
         station("own", port) as peer,
     ):
-        peer.say("point", "T", "TARGET 1", "10 20 30")
+        peer.say("point", "T", "Target_1", "10 20 30")
         assert peer.wait_for(about_plans)["name"] == "proposed"
         since = peer.mark()
         peer.say("point", "E", "Entry", "10 20 60")
