@@ -69,6 +69,46 @@ def test_a_proposal_stays_open_while_nothing_moves(tmp_path):
         room.call("refuse_proposal", number=number, why="no")
 
 
+def by_dicom(room, **more):
+    """What the listener notes of a plan that a workstation has sent."""
+    body = {"sender": "WORKSTATION 10.0.0.5", "name": "PLAN", "via": "DICOM Spatial Fiducials"}
+    room.do(lambda: room.loop._record.append_event("plan_received", body | more, source="listener"))
+
+
+REFUSED = {
+    "of no frame": {"why": "its TARGET has no frame of reference"},
+    "of another frame": {"target_mm": [1.0, 2.0, 3.0], "frame_of_reference_uid": "1.2.8"},
+    "out of the bore": {"target_mm": [9e3, 2.0, 3.0], "frame_of_reference_uid": "1.2.9"},
+}
+
+
+@pytest.mark.parametrize("plan", REFUSED)
+def test_a_plan_by_dicom_that_is_refused_is_one_alarm_that_says_why(tmp_path, plan):
+    with running_line_room(tmp_path) as room:
+        room.calibrate()
+        by_dicom(room, **REFUSED[plan])
+        told = room.until(lambda s: [a for a in s.alarms if a.code == "plan_refused"])
+        assert not told.proposals
+        (alarm,) = [a for a in room.later().alarms if a.code == "plan_refused"]
+        with room.record() as record:
+            (event,) = record.events_of_kind("proposal_turned_away")
+        assert "WORKSTATION 10.0.0.5" in alarm.text
+        assert alarm.text.endswith(event.body["why"])
+        assert alarm.what_to_do.startswith("Correct the plan")
+
+
+def test_a_frame_of_reference_that_no_slice_confirms_yet_is_not_accepted(tmp_path):
+    with running_line_room(tmp_path) as room:
+        place = patient_mm(41.0, 58.0)
+        by_dicom(room, target_mm=list(place), frame_of_reference_uid="1.2.9")
+        (one,) = room.until(lambda s: s.proposals).proposals
+        with pytest.raises(ConflictError, match="acquire a slice"):
+            room.call("take_proposal", number=one.number, in_water=False)
+        room.calibrate()
+        room.call("take_proposal", number=one.number, in_water=False)
+        assert room.later().target_patient_mm == place
+
+
 def test_a_direction_that_cannot_be_used_yet_is_not_accepted(tmp_path):
     plan = Plan("station", "TGT_1", "OpenIGTLink", (10.0, 20.0, 30.0), None, (0.0, -1.0, 0.0))
     with running_line_room(tmp_path, GUIDE) as room:

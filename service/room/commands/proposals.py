@@ -97,10 +97,19 @@ class ProposalCommands:
             frame_of_reference_uid=body.get("frame_of_reference_uid", ""),
         )
         if "why" in body:
-            told = {"sender": plan.sender, "name": plan.name, "via": plan.via, "why": body["why"]}
-            self._room.note(TURNED_AWAY, plan.sender, {**told, "received": event.event_id})
-            return
-        self.propose(plan, plan.sender, received=event.event_id)
+            self._turn_away(plan, plan.sender, body["why"], event.event_id)
+        else:
+            self.propose(plan, plan.sender, received=event.event_id)
+
+    def _turn_away(self, plan: Plan, by: str, why: str, received: int) -> None:
+        """Record it. To a storage command nobody answers why: of those the room says it."""
+        room = self._room
+        told = {"sender": plan.sender, "name": plan.name, "via": plan.via, "why": why}
+        with room.record.transaction():
+            room.note(TURNED_AWAY, by, {**told, "received": received})
+            if received:
+                text = f"plan {plan.name} ({plan.via}) from {plan.sender} was refused: {why}"
+                room.note("alarm", "", {"alarm": "plan_refused", "text": text})
 
     def propose(self, plan: Plan, by: str, received: int = 0) -> Verdict:
         """Record a plan for the operator to see, unless it cannot be one.
@@ -113,8 +122,7 @@ class ProposalCommands:
             return self._waiting(mine[0], reach_known=not mine[0].note)
         verdict = self._judge(plan, known)
         if verdict.code != "proposed":
-            told = {"sender": plan.sender, "name": plan.name, "via": plan.via, "why": verdict.text}
-            self._room.note(TURNED_AWAY, by, {**told, "received": received})
+            self._turn_away(plan, by, verdict.text, received)
             return verdict
         note = "" if verdict.reach_known else verdict.text
         body = {**_as_json(plan), "note": note, "received": received}
@@ -157,9 +165,12 @@ class ProposalCommands:
         one = self._open(number)
         room = self._room
         plan = Plan(one.sender, one.name, one.via, one.target_mm, one.entry_mm, one.direction)
-        why = why_other_frame(
-            one.frame_of_reference_uid, frame_of_reference(room.record)
-        ) or self._why_void(number)
+        here = frame_of_reference(room.record)
+        why = why_other_frame(one.frame_of_reference_uid, here) or self._why_void(number)
+        if one.frame_of_reference_uid and not here:
+            why = (
+                "nobody can tell yet whether it is meant for the table as it lies: acquire a slice"
+            )
         if why:
             raise ConflictError("other_frame", f"Not accepted: {why}.")
         try:
