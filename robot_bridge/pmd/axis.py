@@ -99,7 +99,7 @@ class PmdAxis(PmdController):
             yield from self.read_position_surely()
             yield from self.read_status()  # a count that a reset has put to zero is no place
         except PmdError:
-            self.certain = False
+            self.lose_position()
             self.unread = False
             raise
         self.at_rest_um = self.position_um
@@ -115,7 +115,7 @@ class PmdAxis(PmdController):
         leg, self._cut_leg = self._cut_leg, None
         self.within_um = leg.unsure_um(self.position_um)
         if leg.stale and leg.gone_um(self.position_um) <= self.jitter_um:
-            self.certain = False
+            self.lose_position()
 
     def refresh(self) -> Procedure:
         yield from self._forget_stored()  # of a motion that was stopped
@@ -176,15 +176,14 @@ class PmdAxis(PmdController):
             self.proven = True
         finally:
             if not self.proven:  # refuted, or stopped before it was known
-                self.certain = False
+                self.lose_position()
 
     def _check_moving(self) -> Steps[None]:
         """The limit bit tells of the last motion, so it is only looked at while ours lasts."""
         yield from self.check_status()
         if self.status & Status.EXTERNAL_LIMIT:
-            self.certain = (
-                False  # the travel ends before the switches: the axis is not where it reads
-            )
+            # The travel ends before the switches: the axis is not where it reads.
+            self.lose_position()
             raise self.error("external_limit", "a limit switch stopped the motor")
 
     def _go(self, command: Command) -> Steps[None]:
@@ -250,12 +249,13 @@ class PmdAxis(PmdController):
             if not status & (Status.TARGET_MODE | Status.RUNNING):
                 if "T" in self.doubts and error_um <= self.jitter_um:
                     return  # a board that knows no target mode
+                self.lose_position()  # as an armed index would stop it, and reset the count
                 raise self.error("stopped", f"left target mode {error_um:.0f} um short")
             if watch.is_away(error_um):  # a count that was reset in between looks the same
                 yield from self.read_status()
                 yield from self.check_status()
             if wrong := watch.what_is_wrong(error_um, asked_s, self.clock()):
-                self.certain = False
+                self.lose_position()
                 raise self.error(*wrong)
 
     def _leave_target_mode(self) -> Steps[None]:
@@ -305,7 +305,7 @@ class PmdAxis(PmdController):
             if self._run is not None:  # stopped, failed or given up
                 self._run = None
                 if not self.closed_loop:
-                    self.certain = False
+                    self.lose_position()
                     self._cut = run
                     self._place_cut()
 
@@ -375,10 +375,9 @@ class PmdAxis(PmdController):
 
     def declare(self, position_um: int) -> Procedure:
         """The axis stands at `position_um`. Out of target mode, or setting E would move it."""
-        self.certain = False
+        self.lose_position()
         if self.needs_setup:
             yield from initialise(self)
-            self.certain = False
         if self.closed_loop:
             yield from self._leave_target_mode()
             yield from self.declare_count(pmd_units.count_from_um(self.config, position_um))
@@ -388,10 +387,8 @@ class PmdAxis(PmdController):
 
     def declare_count(self, count: int) -> Steps[None]:
         wanted_um = pmd_units.um_from_count(self.config, count)
+        yield Command(self.address, f"E{count}", reads=False)
         yield from self.read_position()
-        if self.position_um != wanted_um:
-            yield Command(self.address, f"E{count}", reads=False)
-            yield from self.read_position()
         if abs(self.position_um - wanted_um) > self.jitter_um:
             raise self.error("setting", f"reads {self.position_um:.0f} um after E{count}")
         yield from self.set_mark(DECLARED_MARK)
@@ -399,7 +396,7 @@ class PmdAxis(PmdController):
 
     def _declared(self) -> None:
         self.at_rest_um = self.position_um
-        self.certain = True
+        self.certain = self.believes_mark = True
         self._cut = self._cut_leg = self.within_um = None
         self.fault = None
 

@@ -11,17 +11,16 @@ from robot_bridge.daemon.config import HOMING_OVERTRAVEL
 from robot_bridge.pmd import protocol as pmd_protocol
 from robot_bridge.pmd import units as pmd_units
 from robot_bridge.pmd.axis import PmdAxis
-from robot_bridge.pmd.controller import AxisFaultError, Steps
+from robot_bridge.pmd.controller import INDEX_HAS_RESET, INDEX_RESETS, AxisFaultError, Steps
 from robot_bridge.pmd.line import Procedure
 from robot_bridge.pmd.progress import FOLLOWS, agrees, disagreement
 from robot_bridge.pmd.protocol import Command
-from robot_bridge.pmd.setup import verify
+from robot_bridge.pmd.setup import INDEX_POSITION, disarm_index, verify
 from robot_bridge.pmd.status import Inputs
 
 CHUNK_UM = 2000.0  # of a run towards a mechanical end, between two looks at the encoder
 BACK_OFF_UM, PULL_OFF_UM = 1000.0, 500.0
 STANDS = 0.2  # of the way that the motor's steps should make
-INDEX_OFF, INDEX_LATCHED, INDEX_SEARCH = 0, 1, 4
 
 
 def home(axis: PmdAxis, home_um: int) -> Procedure:
@@ -29,7 +28,8 @@ def home(axis: PmdAxis, home_um: int) -> Procedure:
     axis.fault = None
     yield from verify(axis)
     yield from axis.unpark()
-    axis.certain = False
+    axis.lose_position()
+    yield from axis.withdraw_mark()
     axis.proven = False
     if axis.config.home_to == "index":
         yield from _home_to_index(axis, home_um)
@@ -176,21 +176,22 @@ def _run_to_end(axis: PmdAxis, outwards: int, search_um: float) -> Steps[None]:
 
 
 def _home_to_index(axis: PmdAxis, home_um: int) -> Steps[None]:
-    """The count is reset as the index passes; what was travelled since then is in it."""
+    """The count is set to Y14 as the index passes; what was travelled since then is in it."""
+    if not axis.tells_index:
+        raise _cannot(axis, "its controller does not answer N: the index is not known to pass")
     outwards = _outwards(axis, home_um)
+    reply = yield from axis.ask_if_it_can(f"Y{INDEX_POSITION}", "its index is taken for count 0")
+    at_index = reply.integer() if reply else 0
     for direction in (outwards, -outwards):
         yield from axis.read_position()
         from_um = axis.position_um
-        yield Command(axis.address, f"N{INDEX_SEARCH}", reads=False)
-        found = yield from _search_index(axis, direction * _search_um(axis))
-        if found:
+        if (yield from _search_index(axis, direction * _search_um(axis))):
             yield pmd_protocol.stop(axis.address)
-            count = (yield from axis.ask("E")).integer()
-            offset = pmd_units.count_from_um(axis.config, home_um)
-            yield from axis.declare_count(count + offset)
+            yield from axis.read_position_surely()
+            count = pmd_units.count_from_um(axis.config, axis.position_um)
+            home_count = pmd_units.count_from_um(axis.config, home_um)
+            yield from axis.declare_count(count - at_index + home_count)
             return
-        # else the next run would end at the index, and its count begin anew there
-        yield Command(axis.address, f"N{INDEX_OFF}", reads=False)
         yield from _expect_any_motion(axis, from_um)
     raise _cannot(axis, "the encoder's index was not found in either direction")
 
@@ -203,11 +204,18 @@ def _expect_any_motion(axis: PmdAxis, from_um: float) -> Steps[None]:
 
 def _search_index(axis: PmdAxis, distance_um: float) -> Steps[bool]:
     microsteps = pmd_units.microsteps_from_um(axis.config, distance_um)
+    axis.seeks_index = axis.needs_setup = True  # if it is left before its end, it is to be disarmed
     try:
-        yield from axis.run_to_index(microsteps)
-    except AxisFaultError as error:
-        if error.code != "external_limit":
-            raise
-        yield pmd_protocol.stop(axis.address)
-    mode = (yield from axis.ask("N")).integer()
-    return mode == INDEX_LATCHED
+        yield Command(axis.address, f"N{INDEX_RESETS}", reads=False)
+        try:
+            yield from axis.run_to_index(microsteps)
+        except AxisFaultError as error:
+            if error.code != "external_limit":
+                raise
+            yield pmd_protocol.stop(axis.address)
+        # Left armed, a later run would end at the index, and its count begin anew there.
+        mode = yield from disarm_index(axis)
+    finally:
+        axis.seeks_index = False
+    axis.needs_setup = False
+    return mode == INDEX_HAS_RESET

@@ -9,6 +9,8 @@ from robot_bridge.pmd import protocol as pmd_protocol
 from robot_bridge.pmd import units as pmd_units
 from robot_bridge.pmd.controller import (
     DECLARED_MARK,
+    INDEX_HAS_RESET,
+    INDEX_OFF,
     INITIALISED_MARK,
     MARK,
     MODELS,
@@ -24,7 +26,7 @@ RAMP_UP_HZ_PER_MS = 20
 RAMP_DOWN_HZ_PER_MS = 10
 SERIAL_TRIES = 5
 NO_ENCODER = 0
-ENCODER_TYPE, RESPONSE_DELAY = 13, 44
+ENCODER_DIRECTION, ENCODER_TYPE, INDEX_POSITION, RESPONSE_DELAY = 6, 13, 14, 44
 FIRST_IN_ALL, LAST_IN_ALL = 2, 13  # what Y30 tells in one answer
 
 
@@ -42,7 +44,13 @@ def initialise(c: PmdController) -> Steps[None]:
     c.status_body = "U" if c.config.estop_input is None else "U4"  # with the inputs
     first = yield from c.read_status()
     yield from c.read_status()  # what was latched is cleared now
-    declared = mark == DECLARED_MARK and not first & Status.RESET
+    at_index = yield from disarm_index(c)
+    declared = (
+        mark == DECLARED_MARK
+        and c.believes_mark
+        and not first & (Status.RESET | Status.ENCODER_ERROR)
+        and at_index != INDEX_HAS_RESET
+    )
     yield from _probe_storing(c)
     moved = yield from _apply_settings(c)
     yield from c.read_position()
@@ -65,6 +73,7 @@ def verify(c: PmdController) -> Steps[None]:
         c.needs_setup = board != c.board
         c.certain = c.certain and not c.needs_setup
         _check_board(c, board)
+    yield from _check_index(c)
     if not c.settings:
         return
     differing = yield from _differing(c)
@@ -73,6 +82,8 @@ def verify(c: PmdController) -> Steps[None]:
     for number, value in differing.items():
         c.needs_setup = True
         c.certain = False
+        if number in (ENCODER_DIRECTION, ENCODER_TYPE):  # who knows what it counted since
+            c.lose_position()
         raise c.error("setting", f"Y{number} reads {value}, not {c.settings[number]} as set")
 
 
@@ -127,6 +138,36 @@ def _stop(c: PmdController) -> Steps[None]:
 def _read_mark(c: PmdController) -> Steps[int | None]:
     reply = yield from c.ask_if_it_can(MARK, "a supply failure shows only in its status")
     return reply.integer() if reply else None
+
+
+def disarm_index(c: PmdController) -> Steps[int | None]:
+    """Whoever armed it: passing it would reset the count. Returns the mode in which it was found.
+
+    E clears it as well, but nothing may have to be declared.
+    """
+    c.tells_index = c.index_trapped = False
+    reply = yield from c.ask_if_it_can("N", "whether its index may reset the count")
+    if reply is None:
+        return None
+    found = reply.integer()
+    yield Command(c.address, f"N{INDEX_OFF}", reads=False)
+    now = (yield from c.ask("N")).integer()
+    if now != INDEX_OFF:
+        raise c.error("setting", f"N reads {now} after it was set to {INDEX_OFF}")
+    c.tells_index = True
+    return found
+
+
+def _check_index(c: PmdController) -> Steps[None]:
+    if not (c.tells_index and c.closed_loop):
+        return
+    mode = (yield from c.ask("N")).integer()
+    if mode != INDEX_OFF:
+        mode = (yield from c.ask("N")).integer()  # it may have been the line
+    if mode != INDEX_OFF:
+        c.needs_setup = True
+        c.lose_position()
+        raise c.error("index", f"the encoder's index was armed: N reads {mode}")
 
 
 def _probe_storing(c: PmdController) -> Steps[None]:

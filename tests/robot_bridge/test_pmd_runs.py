@@ -1,58 +1,14 @@
 """A motion that was cut short: how far it went is known as well as the time tells, no better."""
 
 import math
-import random
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from pmd_rig import axis_config
-from virtual_ports import Line, Plug
+from virtual_bench import NAMES, Bench
 
-from robot_bridge.emulator.axis import EmulatedController, Motor
-from robot_bridge.emulator.bus import EmulatedBus
-from robot_bridge.emulator.physics import IdealStage
-from robot_bridge.emulator.switches import Switches
-from robot_bridge.pmd.driver import PmdMotors
 from robot_bridge.pmd.protocol import MICROSTEPS_PER_STEP
 from robot_bridge.pmd.runs import Pace, Run
-
-NAMES = ("xt", "yt", "xb", "yb")
-
-
-class Bench:
-    """Four axes on one bus, in virtual time."""
-
-    def __init__(self, drive: str, latency_s: float, speed_factor: float = 1.0) -> None:
-        switches = Switches()
-        self.line = Line()
-        self.boards = [
-            EmulatedController(n, IdealStage(), Motor(), switches, self.line.now_s, speed_factor)
-            for n in (1, 2, 3, 4)
-        ]
-        bus = EmulatedBus(self.boards, switches, random.Random(1))
-        bus.faults.reply_delay_s = latency_s
-        self.line.plugs["port"] = Plug(self.line, bus)
-        axes = [axis_config(name, "port", n, drive) for n, name in enumerate(NAMES, start=1)]
-        self.motors = PmdMotors(axes, clock=lambda: self.line.now_s, open_port=self.line.open_port)
-        self.motors.open()
-        self.motors.declare_position(dict.fromkeys(NAMES, 0))
-
-    def poll_for(self, seconds: float) -> None:
-        until_s = self.line.now_s + seconds
-        while self.line.now_s < until_s and self.motors.poll().moving:
-            self.line.wait(0.02)
-
-    def truth_um(self, axis: str) -> float:
-        return self.boards[NAMES.index(axis)].physics.position_um
-
-    def move_and_stop(self, to_um: int, at_um: float) -> None:
-        self.motors.move_to({"xt": to_um})
-        while self.truth_um("xt") < at_um:
-            self.motors.poll()
-            self.line.wait(0.005)
-        self.motors.stop()
-        self.poll_for(5.0)
 
 
 @pytest.mark.parametrize("latency_s", [0.0, 0.03])
@@ -98,10 +54,7 @@ def test_a_stop_has_not_ended_before_the_encoder_was_asked_where_the_axis_stands
 def test_an_encoder_that_died_just_before_a_stop_is_within_what_is_said(latency_s: float):
     """Nobody can have seen it: the last look was good, and there is no other."""
     bench = Bench("closed_loop", latency_s)
-    bench.motors.move_to({"xt": 12_000})
-    while bench.truth_um("xt") < 3000:
-        bench.motors.poll()
-        bench.line.wait(0.005)
+    bench.move_until(12_000, 3000)
     bench.boards[0].faults.encoder_frozen = True
     bench.line.wait(0.05)
     bench.motors.stop()
