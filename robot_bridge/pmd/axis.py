@@ -22,7 +22,7 @@ from robot_bridge.pmd.protocol import (
     PmdRefusedError,
 )
 from robot_bridge.pmd.runner import PmdRunner
-from robot_bridge.pmd.setup import initialise, verify
+from robot_bridge.pmd.setup import disarm_index, initialise, verify
 from robot_bridge.pmd.status import ERRORS, Status
 
 # Before its first way an encoder has to follow a short run in open loop, long enough to judge it.
@@ -247,8 +247,12 @@ class PmdAxis(PmdRunner):
 
     def declare_count(self, count: int) -> Steps[None]:
         wanted_um = pmd_units.um_from_count(self.config, count)
-        yield Command(self.address, f"E{count}", reads=False)
+        if self.tells_index:
+            yield from disarm_index(self)  # E does it as well, where it has to be written
         yield from self.read_position()
+        if self.position_um != wanted_um:
+            yield Command(self.address, f"E{count}", reads=False)
+            yield from self.read_position()
         if abs(self.position_um - wanted_um) > self.jitter_um:
             raise self.error("setting", f"reads {self.position_um:.0f} um after E{count}")
         yield from self.set_mark(DECLARED_MARK)
