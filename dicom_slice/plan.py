@@ -1,20 +1,21 @@
 """Target and entry point in what a workstation sends: a presentation state, a measurement report
 (TID 1500) or a Spatial Fiducials object.
 
-Points are taken by label, TARGET or ENTRY (also "target point"), never by their order. A point is
-given in patient mm (LPS) of a frame of reference, or on an image that it names.
+Points are taken by label, TARGET or ENTRY (also "target point", "Target 1"), never by their order.
+A point is given in patient mm (LPS) of a frame of reference, or on an image that it names. What has
+a label and is no such point is kept with the reason, so that nobody waits for it in vain.
 """
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 from pydicom.dataset import Dataset
 
 from dicom_slice.header import read_data_set
-from dicom_slice.reasons import Reason, UnusableError
 
 SPATIAL_FIDUCIALS = "1.2.840.10008.5.1.4.1.1.66.2"
 _PRESENTATION_STATES = ("1.2.840.10008.5.1.4.1.1.11.1", "1.2.840.10008.5.1.4.1.1.11.2")
@@ -29,8 +30,8 @@ PLAN_CLASSES = {
     **dict.fromkeys(_REPORTS, "measurement report"),
 }
 TARGET, ENTRY = "TARGET", "ENTRY"
-_LABEL = re.compile(r"\s*(TARGET|ENTRY)(?:[ _-]?POINT)?\s*", re.IGNORECASE)
-_MOST_POINTS, _DEEPEST = 1000, 12
+_LABEL = re.compile(r"\s*(TARGET|ENTRY)(?:[ _-]?POINT)?(?:[ _#-]*\d{1,3})?\s*", re.IGNORECASE)
+_MOST_POINTS, _DEEPEST, _MOST_ITEMS = 1000, 12, 20_000
 
 
 @dataclass(frozen=True)
@@ -45,42 +46,54 @@ class OnImage:
 
 @dataclass(frozen=True)
 class PlanPoint:
-    """label: TARGET or ENTRY; patient_mm with its frame of reference, or else on_image."""
+    """label: TARGET or ENTRY; patient_mm with its frame of reference, or else on_image, or else why
+    it has no place. images: without a frame of reference, the UIDs of those whose it is.
+    """
 
     label: str
     patient_mm: tuple[float, float, float] | None = None
     frame_of_reference_uid: str = ""
     on_image: OnImage | None = None
+    images: tuple[str, ...] = ()
+    why: str = ""
 
 
 @dataclass(frozen=True)
 class PlanObject:
-    """kind: in words. name: what the sender calls it."""
+    """kind: in words. name: what the sender calls it. why: it cannot be read."""
 
     kind: str
     name: str
     points: tuple[PlanPoint, ...]
+    why: str = ""
 
 
 def plan_in(path: Path, made_by_us: str) -> PlanObject | None:
     """The labelled points of a file; None if it is no such object, has none, or is our own.
 
     made_by_us: our Manufacturer, so that an archive that sends everything on proposes nothing.
-    Raises UnusableError for a file that is damaged.
+    Raises UnusableError for a file that cannot be opened.
     """
     data_set, _ = read_data_set(path)
     kind = PLAN_CLASSES.get(str(data_set.get("SOPClassUID", "")))
     if kind is None or str(data_set.get("Manufacturer", "")) == made_by_us:
         return None
+    name = kind
     try:
-        found = tuple(_points(data_set))[:_MOST_POINTS]
         name = str(data_set.get("ContentLabel") or data_set.get("SeriesDescription") or kind)
-    except UnusableError:
-        raise
+        found = tuple(islice(_points(data_set), _MOST_POINTS))
     except Exception as error:  # whatever pydicom raises for a damaged element
-        text = f"a damaged plan ({type(error).__name__})"
-        raise UnusableError(Reason.UNREADABLE, text) from error
+        return PlanObject(kind, name, (), f"it is damaged ({type(error).__name__})")
     return PlanObject(kind, name, found) if found else None
+
+
+def label_of(*words: Any) -> str:
+    """TARGET or ENTRY if one of the words is its name; else nothing."""
+    for word in words:
+        found = _LABEL.fullmatch(str(word)) if word else None
+        if found is not None:
+            return found.group(1).upper()
+    return ""
 
 
 def _points(data_set: Dataset) -> Iterator[PlanPoint]:
@@ -89,24 +102,45 @@ def _points(data_set: Dataset) -> Iterator[PlanPoint]:
     elif data_set.SOPClassUID in _PRESENTATION_STATES:
         yield from _of_presentation(data_set)
     else:
-        for item in data_set.get("ContentSequence") or ():
-            yield from _of_content(item, [], 0)
+        yield from _Report(data_set).points()
+
+
+# Spatial Fiducials
 
 
 def _of_fiducials(data_set: Dataset) -> Iterator[PlanPoint]:
     for each in data_set.get("FiducialSetSequence") or ():
-        frame = str(each.get("FrameOfReferenceUID", ""))
+        frame = str(each.get("FrameOfReferenceUID") or "")
+        images = _uids(each.get("ReferencedImageSequence"))
         for item in each.get("FiducialSequence") or ():
             codes = item.get("FiducialIdentifierCodeSequence") or ()
             words = [item.get("FiducialIdentifier"), item.get("FiducialDescription")]
-            label = _label(*words, *(code.get("CodeMeaning") for code in codes))
-            data = item.get("ContourData")
-            if label and item.get("ShapeType") == "POINT" and data and len(data) == 3:
-                yield PlanPoint(label, _three(data), frame)
+            label = label_of(*words, *(code.get("CodeMeaning") for code in codes))
+            if label:
+                yield from _of_fiducial(label, item, frame, images)
+
+
+def _of_fiducial(
+    label: str, item: Dataset, frame: str, images: tuple[str, ...]
+) -> Iterator[PlanPoint]:
+    shape, data = item.get("ShapeType"), item.get("ContourData")
+    on_images = item.get("GraphicCoordinatesDataSequence") or ()
+    if shape != "POINT":
+        yield PlanPoint(label, why=f"is a {shape}, not a POINT")
+    elif data:
+        yield _in_space(label, data, frame, images)
+    else:
+        for one in on_images:
+            yield _on(label, one.get("ReferencedImageSequence") or (), one.get("GraphicData"))
+    if shape == "POINT" and not data and not on_images:
+        yield PlanPoint(label, why="has no coordinates")
+
+
+# Presentation states
 
 
 def _of_presentation(data_set: Dataset) -> Iterator[PlanPoint]:
-    """A POINT in a layer of that name; or a text of that word, at its anchor."""
+    """A POINT in a layer of that name, or beside one text of that word; or the text's anchor."""
     everywhere = [
         image
         for series in data_set.get("ReferencedSeriesSequence") or ()
@@ -114,42 +148,100 @@ def _of_presentation(data_set: Dataset) -> Iterator[PlanPoint]:
     ]
     for annotation in data_set.get("GraphicAnnotationSequence") or ():
         images = annotation.get("ReferencedImageSequence") or everywhere
-        if len(images) != 1:
-            continue  # over several images: nobody can tell at which depth
-        layer = _label(annotation.get("GraphicLayer"))
-        for item in annotation.get("GraphicObjectSequence") or ():
-            is_point = item.get("GraphicType") == "POINT"
-            if layer and is_point and item.get("GraphicAnnotationUnits") == "PIXEL":
-                yield PlanPoint(layer, on_image=_on(images[0], item.GraphicData))
-        for text in annotation.get("TextObjectSequence") or ():
-            label = _label(text.get("UnformattedTextValue"))
-            at = text.get("AnchorPoint")
-            if label and at and text.get("AnchorPointAnnotationUnits") == "PIXEL":
-                yield PlanPoint(label, on_image=_on(images[0], at))
+        texts = [
+            (label, text)
+            for text in annotation.get("TextObjectSequence") or ()
+            if (label := label_of(text.get("UnformattedTextValue")))
+        ]
+        beside = {label for label, _ in texts}
+        layer = label_of(annotation.get("GraphicLayer"))
+        drawn = layer or (beside.pop() if len(beside) == 1 else "")
+        graphics = annotation.get("GraphicObjectSequence") or ()
+        points = [item for item in graphics if item.get("GraphicType") == "POINT"]
+        for item in points if drawn else ():
+            yield _drawn(drawn, images, item.GraphicData, item.get("GraphicAnnotationUnits"))
+        if layer and graphics and not points:
+            yield PlanPoint(layer, why=f"is a {graphics[0].get('GraphicType')}, not a POINT")
+        for label, text in texts:
+            if label == drawn and points:
+                continue  # it says what the point beside it is
+            at, units = text.get("AnchorPoint"), text.get("AnchorPointAnnotationUnits")
+            if at:
+                yield _drawn(label, images, at, units)
+            else:
+                yield PlanPoint(label, why="is a text that points at nothing")
 
 
-def _of_content(item: Dataset, above: list[str], depth: int) -> Iterator[PlanPoint]:
-    """A POINT below, or named by, a label: a tracking identifier, a finding, a concept."""
-    if depth > _DEEPEST:
-        return
-    inner = list(item.get("ContentSequence") or ())
-    label = _label(*_words(item))
-    names = [*above, label] if label else above
-    if item.get("ValueType") == "CONTAINER":
-        own = {found for one in inner if (found := _label(*_words(one), *_values(one)))}
-        names = [*above, *own] if len(own) == 1 else names
-    kind = item.get("GraphicType")
-    if names and kind == "POINT" and item.get("ValueType") == "SCOORD3D":
-        yield PlanPoint(
-            names[-1], _three(item.GraphicData), str(item.get("ReferencedFrameOfReferenceUID", ""))
+def _drawn(label: str, images: Sequence[Dataset], at: Any, units: Any) -> PlanPoint:
+    if units == "PIXEL":
+        return _on(label, images, at)
+    return PlanPoint(label, why=f"is given in {units} units: draw it on the image, in PIXEL units")
+
+
+# Measurement reports
+
+
+class _Report:
+    """The content of a report: a tree in which items may also stand by reference to others."""
+
+    def __init__(self, data_set: Dataset) -> None:
+        self._root = data_set
+        self._left = _MOST_ITEMS
+        self._evidence = tuple(
+            uid
+            for study in data_set.get("CurrentRequestedProcedureEvidenceSequence") or ()
+            for series in study.get("ReferencedSeriesSequence") or ()
+            for uid in _uids(series.get("ReferencedSOPSequence"))
         )
-    if names and kind == "POINT" and item.get("ValueType") == "SCOORD":
-        images = [one for one in inner if one.get("ReferencedSOPSequence")]
-        if len(images) == 1:
-            at = _on(images[0].ReferencedSOPSequence[0], item.GraphicData)
-            yield PlanPoint(names[-1], on_image=at)
-    for one in inner:
-        yield from _of_content(one, names, depth + 1)
+
+    def points(self) -> Iterator[PlanPoint]:
+        for item in self._inner(self._root):
+            yield from self._below(item, [], 0)
+
+    def _inner(self, item: Dataset) -> list[Dataset]:
+        return [self._meant(one) for one in item.get("ContentSequence") or ()]
+
+    def _meant(self, item: Dataset) -> Dataset:
+        """The item itself, or the one that it refers to: its place in the tree, 1 is the root."""
+        place = item.get("ReferencedContentItemIdentifier")
+        if not place:
+            return item
+        first, *rest = [place] if isinstance(place, int) else place
+        found = self._root
+        for number in rest:
+            if not 0 < number <= len(found.get("ContentSequence") or ()):
+                return item
+            found = found.ContentSequence[number - 1]
+        return found if first == 1 else item
+
+    def _below(self, item: Dataset, above: list[str], depth: int) -> Iterator[PlanPoint]:
+        """A point below, or named by, a label: a tracking identifier, a finding, a concept."""
+        self._left -= 1
+        if self._left < 0:
+            raise ValueError("more content than a plan has")
+        if depth > _DEEPEST:
+            return
+        inner = self._inner(item)
+        label = label_of(*_words(item))
+        names = [*above, label] if label else above
+        if item.get("ValueType") == "CONTAINER":
+            own = {found for one in inner if (found := label_of(*_words(one), *_values(one)))}
+            names = [*above, *own] if len(own) == 1 else names
+        if names and item.get("ValueType") in ("SCOORD", "SCOORD3D"):
+            yield self._point(names[-1], item, inner)
+        for one in inner:
+            yield from self._below(one, names, depth + 1)
+
+    def _point(self, label: str, item: Dataset, inner: list[Dataset]) -> PlanPoint:
+        kind, data = item.get("GraphicType"), item.get("GraphicData") or ()
+        images = [one.ReferencedSOPSequence[0] for one in inner if one.get("ReferencedSOPSequence")]
+        in_space = item.ValueType == "SCOORD3D"
+        if kind not in ("POINT", "MULTIPOINT") or len(data) != (3 if in_space else 2):
+            return PlanPoint(label, why=f"is a {kind} of {len(data)} coordinates, not one point")
+        if not in_space:
+            return _on(label, images, data)
+        frame = str(item.get("ReferencedFrameOfReferenceUID") or "")
+        return _in_space(label, data, frame, _uids(images) or self._evidence)
 
 
 def _words(item: Dataset) -> list[Any]:
@@ -161,23 +253,33 @@ def _values(item: Dataset) -> list[Any]:
     return [item.get("TextValue"), *(code.get("CodeMeaning") for code in codes)]
 
 
-def _label(*words: Any) -> str:
-    for word in words:
-        found = _LABEL.fullmatch(str(word)) if word else None
-        if found is not None:
-            return found.group(1).upper()
-    return ""
+# Pieces
 
 
-def _on(image: Dataset, data: Any) -> OnImage:
-    """Graphic data are (column, row) from the outer corner of the first pixel."""
-    col, row = (float(value) for value in list(data)[:2])
-    frames = image.get("ReferencedFrameNumber")
-    first = frames[0] if isinstance(frames, list) or hasattr(frames, "__iter__") else frames
-    frame = int(first) - 1 if first else 0
-    return OnImage(str(image.ReferencedSOPInstanceUID), frame, row - 0.5, col - 0.5)
-
-
-def _three(data: Any) -> tuple[float, float, float]:
+def _in_space(label: str, data: Any, frame: str, images: tuple[str, ...]) -> PlanPoint:
+    if len(data) != 3:
+        return PlanPoint(label, why=f"needs three coordinates, has {len(data)}")
     x, y, z = (float(value) for value in data)
-    return x, y, z
+    return PlanPoint(label, (x, y, z), frame, images=() if frame else images)
+
+
+def _on(label: str, images: Sequence[Dataset], data: Any) -> PlanPoint:
+    """Graphic data are (column, row) from the outer corner of the first pixel."""
+    if len(images) != 1:
+        many = f"on {len(images)} images" if images else "on no image"
+        return PlanPoint(label, why=f"is drawn {many}: it must be on one, to have a depth")
+    if data is None or len(data) != 2:
+        return PlanPoint(label, why="is not one point of a column and a row")
+    col, row = (float(value) for value in data)
+    frames = images[0].get("ReferencedFrameNumber")
+    numbers = [frames] if isinstance(frames, int) else list(frames or ())
+    if len(numbers) > 1:
+        why = f"is drawn on {len(numbers)} frames: it must be on one, to have a depth"
+        return PlanPoint(label, why=why)
+    frame = int(numbers[0]) - 1 if numbers else 0
+    uid = str(images[0].ReferencedSOPInstanceUID)
+    return PlanPoint(label, on_image=OnImage(uid, frame, row - 0.5, col - 0.5))
+
+
+def _uids(images: Sequence[Dataset] | None) -> tuple[str, ...]:
+    return tuple(str(image.ReferencedSOPInstanceUID) for image in images or ())

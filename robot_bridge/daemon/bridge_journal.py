@@ -5,7 +5,7 @@ what has happened anyway (a stop, a note) are counted as missing instead.
 """
 
 from collections import Counter
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import replace
 
 from robot_bridge.daemon.journal import CommandRecord, Journal, JournalError, LatchedStop
@@ -39,11 +39,16 @@ class BridgeJournal:
     def begin(self, record: CommandRecord, stands: Mapping[str, Stand]) -> None:
         self._journal.begin(record, self._wall_clock(), stands)
 
-    def end(self, record: CommandRecord, stands: Mapping[str, Stand] | None = None) -> None:
-        self._journal.end(record, self._wall_clock(), stands)
+    def end(
+        self,
+        record: CommandRecord,
+        stands: Mapping[str, Stand] | None = None,
+        certain: Collection[str] = (),
+    ) -> None:
+        self._journal.end(record, self._wall_clock(), stands, certain)
 
-    def keep_stands(self, stands: Mapping[str, Stand]) -> None:
-        self._journal.keep_stands(stands, self._wall_clock())
+    def keep_stands(self, stands: Mapping[str, Stand], certain: Collection[str]) -> None:
+        self._journal.keep_stands(stands, self._wall_clock(), certain)
 
     def tie_boards(self, boards: Mapping[str, str]) -> None:
         """Boards that were not known yet; those that were stay what they were."""
@@ -67,6 +72,12 @@ class BridgeJournal:
             self._journal.latch_stop(stop, text, self._wall_clock())
         except JournalError:
             self._refused[Code.JOURNAL.value] += 1  # it is latched all the same, until a restart
+
+    def keep_lost(self, stands: Mapping[str, Stand], certain: Collection[str]) -> None:
+        try:
+            self.keep_stands(stands, certain)
+        except JournalError:
+            self._refused[Code.JOURNAL.value] += 1
 
     def note(self, what: str, **details: object) -> None:
         # A note that cannot be written must not keep a stop from happening.

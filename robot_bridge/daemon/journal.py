@@ -9,7 +9,7 @@ import fcntl
 import json
 import os
 import zlib
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -78,7 +78,7 @@ class Journal:
         self.measurements_used: set[str] = set()
         self.insertion_locked = False
         self.stop = LatchedStop()
-        self.settled: dict[str, Stand] = {}  # as each axis stood after its last motion
+        self.settled: dict[str, Stand] = {}  # as each axis stood, certain, after its last motion
         self.stands: dict[str, Stand] = {}  # as it may stand now, if that one came to no end
         self.boards: dict[str, str] = {}  # the serial number of the board that drives each axis
         self._sync = sync
@@ -138,7 +138,8 @@ class Journal:
         elif kind in ("stand", "going"):
             self.stands = {a: stand_from_entry(e) for a, e in entry["axes"].items()}
             if kind == "stand":
-                self.settled = self.stands
+                certain = entry.get("certain", self.stands)  # older journals do not say
+                self.settled = {a: self.stands[a] for a in certain if a in self.stands}
         elif kind == "boards":
             self.boards |= entry["boards"]
         elif kind == "lock":
@@ -161,17 +162,25 @@ class Journal:
         self._append(*entries)
 
     def end(
-        self, record: CommandRecord, wall_s: float, stands: Mapping[str, Stand] | None = None
+        self,
+        record: CommandRecord,
+        wall_s: float,
+        stands: Mapping[str, Stand] | None = None,
+        certain: Collection[str] = (),
     ) -> None:
         """A command that began has ended. Durable. Raises JournalError."""
         entries = [_end_entry(record, wall_s)]
         if stands is not None:
-            entries.append(_stand_entry(stands, wall_s))
+            entries.append(_stand_entry(stands, wall_s, "stand", certain))
         self._append(*entries)
 
-    def keep_stands(self, stands: Mapping[str, Stand], wall_s: float) -> None:
-        """The axes were declared, corrected or moved otherwise. Durable. Raises JournalError."""
-        self._append(_stand_entry(stands, wall_s))
+    def keep_stands(
+        self, stands: Mapping[str, Stand], wall_s: float, certain: Collection[str]
+    ) -> None:
+        """The axes were declared, corrected, moved otherwise or lost; `certain`: the count of
+        these may be believed after a restart. Durable. Raises JournalError.
+        """
+        self._append(_stand_entry(stands, wall_s, "stand", certain))
 
     def tie_boards(self, boards: Mapping[str, str], wall_s: float) -> None:
         """These boards drive these axes. Durable. Raises JournalError."""
@@ -243,9 +252,12 @@ def _begin_entry(record: CommandRecord, wall_s: float, *, accepted: bool) -> dic
     }  # fmt: skip
 
 
-def _stand_entry(stands: Mapping[str, Stand], wall_s: float, kind: str = "stand") -> dict[str, Any]:
+def _stand_entry(
+    stands: Mapping[str, Stand], wall_s: float, kind: str, certain: Collection[str] = ()
+) -> dict[str, Any]:
     return {
         "kind": kind, "t": wall_s, "axes": {a: stand.as_entry() for a, stand in stands.items()},
+        "certain": sorted(certain),
     }  # fmt: skip
 
 

@@ -87,6 +87,8 @@ class MotionInFlight:
         self._certain -= lost
         if self._motion is None:
             self._moved_otherwise(f"lost:{self._boot_id}")
+            self.whereabouts.strayed(lost, self._motors.status.readback_um)
+            self._journal.keep_lost(self.whereabouts.stands, self.certain_axes)
 
     def _moved_otherwise(self, what: str) -> None:
         self.motions += 1
@@ -119,14 +121,14 @@ class MotionInFlight:
         self.last_motion = f"declared:{self._boot_id}:{self._declared}"
         self.whereabouts.declared(positions_um, within_um, were_certain)
         self._motors.poll()
-        self._journal.keep_stands(self.whereabouts.stands)
+        self._journal.keep_stands(self.whereabouts.stands, self.certain_axes)
 
     def correct_position(
         self, correction_um: Mapping[str, int], within_um: Mapping[str, int]
     ) -> None:
         """Raises JournalError."""
         self.whereabouts.corrected(correction_um, within_um)
-        self._journal.keep_stands(self.whereabouts.stands)
+        self._journal.keep_stands(self.whereabouts.stands, self.certain_axes)
 
     # --- begin --------------------------------------------------------------------------------
 
@@ -231,7 +233,7 @@ class MotionInFlight:
         )
         self._know_afterwards(motion, ending)
         try:
-            self._journal.end(record, self.whereabouts.stands)
+            self._journal.end(record, self.whereabouts.stands, self.certain_axes)
         except JournalError as error:
             # After a restart the journal would say FAILED; so it has failed, now and then.
             record = replace(

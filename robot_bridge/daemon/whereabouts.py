@@ -122,6 +122,13 @@ class Whereabouts:
     def homed(self, positions_um: Mapping[str, int]) -> None:
         self.stands |= {axis: Stand(at_um) for axis, at_um in positions_um.items()}
 
+    def strayed(self, axes: Collection[str], readback_um: Mapping[str, int]) -> None:
+        """These are not certain any longer, and read something else without a command of ours."""
+        for axis in axes & self.stands.keys():
+            stand, growth = self.stands[axis], self.growth_of(axis)
+            if abs(readback_um[axis] - stand.at_um) > growth.tolerance_um:
+                self.stands[axis] = stand.on_the_way(readback_um[axis], growth)
+
     def forget(self, axes: Collection[str]) -> None:
         for axis in axes:
             self.stands.pop(axis, None)

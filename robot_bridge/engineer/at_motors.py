@@ -123,7 +123,7 @@ def accept_boards(args: argparse.Namespace, config: BridgeConfig) -> None:
         finally:
             motors.close()
         journal.tie_boards(boards, time.time())
-        journal.keep_stands({}, time.time())  # another board, another count
+        journal.keep_stands({}, time.time(), ())  # another board, another count
     show(args, {"boards": boards})
 
 
@@ -137,7 +137,7 @@ def _refuse_if_held(journal: Journal) -> None:
 def _forget(journal: Journal, axis: AxisConfig) -> None:
     """It is moved by something that no bridge counts."""
     stands = {name: stand for name, stand in journal.stands.items() if name != axis.name}
-    journal.keep_stands(stands, time.time())
+    journal.keep_stands(stands, time.time(), journal.settled.keys() & stands.keys())
 
 
 def measure_steps(args: argparse.Namespace, config: BridgeConfig) -> None:

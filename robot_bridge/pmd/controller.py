@@ -46,6 +46,7 @@ POWER_ON_DELAY_US = 20  # Y44, before a controller answers
 MARK = "H"
 INITIALISED_MARK, DECLARED_MARK = 41, 42
 SUPPLY_PERIOD_S = 5.0
+INDEX_OFF, INDEX_HAS_RESET, INDEX_RESETS = 0, 1, 4  # N
 
 
 class AxisFaultError(PmdError):
@@ -59,7 +60,8 @@ class AxisFaultError(PmdError):
 class PmdController:
     """`needs_setup`: its settings are not known to be ours; nothing moves until they are.
 
-    `board`: its serial number, "" if it does not tell one.
+    `board`: its serial number, "" if it does not tell one. `believes_mark`: nothing was seen since
+    the last declaration that speaks against the count, so that the board's mark may restore it.
     """
 
     def __init__(
@@ -74,6 +76,7 @@ class PmdController:
         self.clock = clock
         self.status = Status(0)
         self.certain = False
+        self.believes_mark = True
         self.needs_setup = True
         self.position_um = 0.0
         self.speed_cap_hz = 1
@@ -91,8 +94,13 @@ class PmdController:
         self.limit_wiring = 0  # Y2
         self.proven = False  # the encoder was seen to follow the motor since the board was set up
         self.settings: dict[int, int] = {}  # Y numbers as they were set and read back
+        self.tells_index = False
+        self.seeks_index = False  # homing has armed it
+        self.index_trapped = False  # it may have reset the count, or stopped the motor
         # One wrong bit makes `T0` (go to zero) of `U0`, but a harmless question of a bare `U`.
         self.status_body = "U"
+        self._answered: set[str] = set()
+        self._silent_to: set[str] = set()
         self._supply_due_s = 0.0
         self._asked_in_vain = False  # what an answer told that nobody heard, it does not tell again
 
@@ -131,20 +139,46 @@ class PmdController:
         return reply
 
     def ask_if_it_can(self, name: str, otherwise: str) -> Steps[Reply | None]:
-        """None, and a doubt for people to read, if this board does not answer that."""
-        try:
-            reply = yield from self.ask(name)
-        except PmdNoValueError:
-            reply = None
-        except PmdTimeoutError:
-            raise
-        except PmdError:
-            reply = None
+        """None, and a doubt for people to read, if this board does not answer that.
+
+        What it was silent to is not asked again; what it has answered before, it can.
+        """
+        reply = None
+        if name not in self._silent_to:
+            try:
+                reply = yield from self.ask(name)
+            except PmdTimeoutError as error:
+                if name in self._answered:
+                    raise
+                yield from self.must_live(error)
+                self._silent_to.add(name)
+            except PmdError:
+                pass
         if reply is None:
             self.doubts[name] = otherwise
             return None
+        self._answered.add(name)
         self.doubts.pop(name, None)
         return reply
+
+    def must_live(self, error: PmdTimeoutError) -> Steps[None]:
+        """A board that is silent to one question answers another; else it is the line, or dead."""
+        if isinstance(error, PmdNoValueError):
+            return
+        try:
+            yield from self.ask("E")
+        except PmdNoValueError:
+            pass
+        except PmdTimeoutError:
+            raise error from None
+        except PmdError:
+            pass
+
+    def begin_anew(self) -> None:
+        """Forget what it was seen to answer or not."""
+        self.doubts = {}
+        self._answered.clear()
+        self._silent_to.clear()
 
     def read_status(self) -> Steps[Status]:
         unheard, self._asked_in_vain = self._asked_in_vain, True
@@ -160,11 +194,35 @@ class PmdController:
             self.estop = not parse_input_bits(reply.value) >> self.config.estop_input & 1
         if (reply.retried or unheard) and not (yield from self.mark_stands()):
             self.status |= Status.RESET  # the answer that told it was lost
+        passed = self.status & Status.INDEX or (self.tells_index and (reply.retried or unheard))
+        if passed and self.closed_loop and not (self.seeks_index or self.needs_setup):
+            yield from self._look_for_index()
         self._asked_in_vain = False
         if self.status & Status.RESET:
             self.needs_setup = True
             self.certain = False
+        if self.status & Status.ENCODER_ERROR and self.closed_loop:
+            self.lose_position()
         return self.status
+
+    def lose_position(self) -> None:
+        """The count is not where the axis stands, or may not be; until it is declared or homed."""
+        self.certain = False
+        self.believes_mark = False
+
+    def withdraw_mark(self) -> Steps[None]:
+        """What was lost is not to be believed by the next program either."""
+        if not self.believes_mark and self.mark == DECLARED_MARK:
+            yield from self.set_mark(INITIALISED_MARK)
+
+    def _look_for_index(self) -> Steps[None]:
+        """Somebody may have armed it; then passing it has reset the count, or stopped the motor."""
+        self.index_trapped = True
+        mode = (yield from self.ask("N")).integer() if self.tells_index else None
+        self.index_trapped = mode != INDEX_OFF
+        if self.index_trapped:
+            self.needs_setup = True
+            self.lose_position()
 
     def mark_stands(self) -> Steps[bool]:
         """Without a mark nothing speaks against a reset: it is believed to have been one."""
@@ -210,6 +268,10 @@ class PmdController:
             self.certain = False
             self.needs_setup = True
             raise self.error("controller_reset", "the controller restarted; position uncertain")
+        if self.index_trapped:
+            raise self.error(
+                "index", "the encoder's index was armed (N) and may have reset the count"
+            )
         if self.estop:
             raise self.error("estop", "the emergency stop is pressed")
         if status & Status.OVERHEAT:
@@ -269,10 +331,10 @@ class PmdController:
     def check_rest(self) -> None:
         """Raise AxisFaultError if the stage moves, or has moved, without a command."""
         if self.status & (Status.RUNNING | Status.TARGET_MODE):
-            self.certain = False
+            self.lose_position()
             raise self.error("moving_by_itself", "the controller moves without a command")
         if self.at_rest_um is not None and not self._is_near(self.position_um, self.at_rest_um):
-            self.certain = False
+            self.lose_position()
             moved_um = self.position_um - self.at_rest_um
             self.at_rest_um = self.position_um
             raise self.error("moved_by_itself", f"moved {moved_um:+.0f} um without a command")

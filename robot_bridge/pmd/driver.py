@@ -284,7 +284,7 @@ class PmdMotors:
             if task.done and task.error is not None:
                 failed = self._note_error(self._axes[name], task.error)
                 if tasks is self._motion and isinstance(task.error, PmdTimeoutError):
-                    self._axes[name].certain = False  # nobody saw where it stopped
+                    self._axes[name].lose_position()  # nobody saw where it stopped
             if task.done and tasks is self._other:
                 del tasks[name]
         return failed
@@ -295,7 +295,7 @@ class PmdMotors:
             log.warning("%s", failed[1])
         axis.fault = failed
         if isinstance(error, PmdEchoError):
-            axis.certain = False
+            axis.lose_position()
         return failed
 
     def _fail(self, code: str, text: str) -> None:
@@ -333,6 +333,8 @@ class PmdMotors:
             log.error("%s", text)
         self._ports.send_stop()
         self._ports.close()
+        for name in self._motion:
+            self._axes[name].lose_position()
         self._motion, self._other = {}, {}
         self._fault, self._reached = (code, text), False
         for axis in self._axes.values():
@@ -392,6 +394,7 @@ class PmdMotors:
 
 def _stand_still(axis: PmdAxis) -> Procedure:
     yield from axis.confirm_stop()
+    yield from axis.withdraw_mark()
     if axis.unread:
         yield from axis.locate()
 
@@ -399,6 +402,7 @@ def _stand_still(axis: PmdAxis) -> Procedure:
 def _look_after(axis: PmdAxis) -> Procedure:
     """What an axis needs while nothing moves."""
     if not axis.needs_setup:
+        yield from axis.withdraw_mark()
         yield from axis.refresh()
         return
     yield from axis.set_up()

@@ -32,6 +32,8 @@ def find_encoder(axis: PmdAxis) -> Steps[EncoderFound]:
     yield from verify(axis)
     yield from axis.unpark()
     axis.needs_setup = True
+    axis.lose_position()  # it may count the other way from now on
+    yield from axis.withdraw_mark()
     axis.at_rest_um = None
     yield Command(axis.address, "Y25,1", reads=False, repeatable=False)
     until_s = axis.clock() + SCRIPT_DEADLINE_S

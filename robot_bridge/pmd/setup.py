@@ -9,6 +9,8 @@ from robot_bridge.pmd import protocol as pmd_protocol
 from robot_bridge.pmd import units as pmd_units
 from robot_bridge.pmd.controller import (
     DECLARED_MARK,
+    INDEX_HAS_RESET,
+    INDEX_OFF,
     INITIALISED_MARK,
     MARK,
     MODELS,
@@ -24,7 +26,7 @@ RAMP_UP_HZ_PER_MS = 20
 RAMP_DOWN_HZ_PER_MS = 10
 SERIAL_TRIES = 5
 NO_ENCODER = 0
-ENCODER_TYPE, RESPONSE_DELAY = 13, 44
+ENCODER_DIRECTION, ENCODER_TYPE, INDEX_POSITION, RESPONSE_DELAY = 6, 13, 14, 44
 FIRST_IN_ALL, LAST_IN_ALL = 2, 13  # what Y30 tells in one answer
 
 
@@ -35,14 +37,20 @@ def initialise(c: PmdController) -> Steps[None]:
     """
     c.needs_setup = True
     c.certain = c.proven = False
-    c.doubts = {}
+    c.begin_anew()
     yield from _identify(c)
     yield from _stop(c)
     c.mark = mark = yield from _read_mark(c)
     c.status_body = "U" if c.config.estop_input is None else "U4"  # with the inputs
     first = yield from c.read_status()
     yield from c.read_status()  # what was latched is cleared now
-    declared = mark == DECLARED_MARK and not first & Status.RESET
+    at_index = yield from disarm_index(c)
+    declared = (
+        mark == DECLARED_MARK
+        and c.believes_mark
+        and not first & (Status.RESET | Status.ENCODER_ERROR)
+        and at_index != INDEX_HAS_RESET
+    )
     yield from _probe_storing(c)
     moved = yield from _apply_settings(c)
     yield from c.read_position()
@@ -65,6 +73,7 @@ def verify(c: PmdController) -> Steps[None]:
         c.needs_setup = board != c.board
         c.certain = c.certain and not c.needs_setup
         _check_board(c, board)
+    yield from _check_index(c)
     if not c.settings:
         return
     differing = yield from _differing(c)
@@ -73,11 +82,13 @@ def verify(c: PmdController) -> Steps[None]:
     for number, value in differing.items():
         c.needs_setup = True
         c.certain = False
+        if number in (ENCODER_DIRECTION, ENCODER_TYPE):  # who knows what it counted since
+            c.lose_position()
         raise c.error("setting", f"Y{number} reads {value}, not {c.settings[number]} as set")
 
 
 def _differing(c: PmdController) -> Steps[dict[int, int]]:
-    now = (yield from _read_all(c)) or {}
+    now = yield from _read_some(c, c.settings)
     return {n: value for n, value in now.items() if c.settings.get(n, value) != value}
 
 
@@ -129,6 +140,36 @@ def _read_mark(c: PmdController) -> Steps[int | None]:
     return reply.integer() if reply else None
 
 
+def disarm_index(c: PmdController) -> Steps[int | None]:
+    """Whoever armed it: passing it would reset the count. Returns the mode in which it was found.
+
+    E clears it as well, but nothing may have to be declared.
+    """
+    c.tells_index = c.index_trapped = False
+    reply = yield from c.ask_if_it_can("N", "whether its index may reset the count")
+    if reply is None:
+        return None
+    found = reply.integer()
+    yield Command(c.address, f"N{INDEX_OFF}", reads=False)
+    now = (yield from c.ask("N")).integer()
+    if now != INDEX_OFF:
+        raise c.error("setting", f"N reads {now} after it was set to {INDEX_OFF}")
+    c.tells_index = True
+    return found
+
+
+def _check_index(c: PmdController) -> Steps[None]:
+    if not (c.tells_index and c.closed_loop):
+        return
+    mode = (yield from c.ask("N")).integer()
+    if mode != INDEX_OFF:
+        mode = (yield from c.ask("N")).integer()  # it may have been the line
+    if mode != INDEX_OFF:
+        c.needs_setup = True
+        c.lose_position()
+        raise c.error("index", f"the encoder's index was armed: N reads {mode}")
+
+
 def _probe_storing(c: PmdController) -> Steps[None]:
     """Whether a command can be stored (`…b`), asked with a question, whose running is harmless."""
     c.can_store = False
@@ -136,10 +177,8 @@ def _probe_storing(c: PmdController) -> Steps[None]:
         yield pmd_protocol.overwrite_stored(c.address)
         stored = yield from c.ask("B")
         c.can_store = stored.value.rstrip("b") == "E"
-    except PmdNoValueError:
-        pass
-    except PmdTimeoutError:
-        raise
+    except PmdTimeoutError as error:
+        yield from c.must_live(error)
     except PmdError:
         pass
     if not c.can_store:
@@ -216,18 +255,20 @@ def _set(c: PmdController, wanted: dict[int, int]) -> Steps[None]:
             continue
         try:
             yield pmd_protocol.set_parameter(c.address, number, value)
-        except PmdNoValueError:
-            if not unread:
+        except PmdTimeoutError as error:
+            if number in have:
                 raise
-    if unread:
-        return  # a board that tells some settings and not others is no witness for any
-    got = yield from _read_some(c, wanted)
-    for number, value in wanted.items():
+            yield from c.must_live(error)
+    told = {number: value for number, value in wanted.items() if number in have}
+    if len(told) < len(wanted) / 2:
+        return  # the few that it tells are no settings: some simulators say what they always say
+    got = yield from _read_some(c, told)
+    for number, value in told.items():
         if got.get(number) != value:
             raise c.error(
                 "setting", f"Y{number} reads {got.get(number)} after it was set to {value}"
             )
-    c.settings = dict(wanted)
+    c.settings = told
 
 
 def _set_one(c: PmdController, number: int, value: int) -> Steps[None]:
@@ -259,8 +300,9 @@ def _read_some(c: PmdController, numbers: dict[int, int]) -> Steps[dict[int, int
         return together
     got: dict[int, int] = {}
     for number in numbers:
-        try:
-            got[number] = (yield from c.ask(f"Y{number}")).integer()
-        except PmdNoValueError:
-            continue
+        name = f"Y{number}"
+        reply = yield from c.ask_if_it_can(name, "")
+        c.doubts.pop(name, None)  # said of all together
+        if reply is not None:
+            got[number] = reply.integer()
     return got

@@ -183,6 +183,160 @@ def test_what_has_no_label_or_is_our_own_is_no_plan(desk):
         assert noted(desk, made) == {}
 
 
+ON_SLICE = [-20 + 10, 10, 24 - 20]  # where presentation_state() has its target
+NO_FRAME_NO_IMAGE = spatial_fiducials(("TARGET", TARGET), frame="")
+
+
+def reference(uid: str = "1.2.826.0.9", **more) -> Dataset:
+    return item(
+        ReferencedSOPClassUID="1.2.840.10008.5.1.4.1.1.4", ReferencedSOPInstanceUID=uid, **more
+    )
+
+
+def fiducial_on_image(*images: Dataset, **more) -> FileDataset:
+    """A point of Spatial Fiducials that has a column and a row, no place in space."""
+    made = spatial_fiducials(("Target 1", TARGET), frame="")
+    (point,) = made.FiducialSetSequence[0].FiducialSequence
+    del point.ContourData
+    at = item(GraphicData=[10.5, 20.5], ReferencedImageSequence=list(images))
+    point.GraphicCoordinatesDataSequence = [at]
+    for keyword, value in more.items():
+        setattr(point, keyword, value)
+    return made
+
+
+def in_images_frame(*uids: str) -> FileDataset:
+    """Coordinates in space, whose frame of reference is that of images."""
+    made = spatial_fiducials(("TARGET", TARGET), frame="")
+    del made.FiducialSetSequence[0].FrameOfReferenceUID
+    made.FiducialSetSequence[0].ReferencedImageSequence = [reference(uid) for uid in uids]
+    return made
+
+
+def content(*items: Dataset) -> FileDataset:
+    made = empty("1.2.840.10008.5.1.4.1.1.88.34", "SR")
+    made.ContentSequence = list(items)
+    return made
+
+
+def coordinates(kind: str, data: list[float], *inner: Dataset, **more) -> Dataset:
+    value_type = "SCOORD" if len(data) == 2 else "SCOORD3D"
+    name = [item(CodeValue="1", CodingSchemeDesignator="99TEST", CodeMeaning="TARGET")]
+    return item(
+        RelationshipType="CONTAINS", ValueType=value_type, ConceptNameCodeSequence=name,
+        GraphicType=kind, GraphicData=data, ContentSequence=list(inner), **more,
+    )  # fmt: skip
+
+
+def image_item(uid: str = "1.2.826.0.9") -> Dataset:
+    return item(
+        RelationshipType="SELECTED FROM", ValueType="IMAGE", ReferencedSOPSequence=[reference(uid)]
+    )
+
+
+def by_reference(*place: int) -> Dataset:
+    return item(RelationshipType="SELECTED FROM", ReferencedContentItemIdentifier=list(place))
+
+
+@pytest.mark.parametrize(
+    ("made", "place"),
+    [
+        (fiducial_on_image(reference()), ON_SLICE),
+        (fiducial_on_image(reference(ReferencedFrameNumber=1)), ON_SLICE),
+        (in_images_frame("1.2.826.0.9"), TARGET),
+        (content(coordinates("POINT", [10.5, 20.5], image_item())), ON_SLICE),
+        (content(image_item(), coordinates("POINT", [10.5, 20.5], by_reference(1, 1))), ON_SLICE),
+        (content(coordinates("MULTIPOINT", [10.5, 20.5], image_item())), ON_SLICE),
+        (content(coordinates("MULTIPOINT", list(TARGET), image_item())), TARGET),
+        (
+            content(coordinates("POINT", list(TARGET), ReferencedFrameOfReferenceUID=FRAME)),
+            TARGET,
+        ),
+    ],
+    ids=[
+        "fiducial on an image", "on its only frame", "frame of the images", "SCOORD",
+        "SCOORD by reference", "SCOORD of one point", "SCOORD3D of one point", "SCOORD3D",
+    ],
+)  # fmt: skip
+def test_every_way_to_say_one_point_is_read_in_the_cases_frame_of_reference(desk, made, place):
+    body = noted(desk, made)
+    assert body.get("target_mm") == pytest.approx(place), body
+    assert body["frame_of_reference_uid"] == FRAME
+
+
+@pytest.mark.parametrize("name", ["TARGET 1", "Target", "target_2", "Target-1", "TARGET POINT 1"])
+def test_a_number_or_the_case_of_its_letters_do_not_hide_a_label(desk, name):
+    assert noted(desk, spatial_fiducials((name, TARGET)))["target_mm"] == pytest.approx(TARGET)
+
+
+@pytest.mark.parametrize("name", ["TARGETED BIOPSY", "no target", "entry 1 of 2", "TARGET 1234"])
+def test_what_only_speaks_of_a_target_is_none(desk, name):
+    assert noted(desk, spatial_fiducials((name, TARGET))) == {}
+
+
+def in_display_units() -> FileDataset:
+    made = presentation_state()
+    del made.GraphicAnnotationSequence[1]
+    made.GraphicAnnotationSequence[0].GraphicObjectSequence[0].GraphicAnnotationUnits = "DISPLAY"
+    return made
+
+
+def over_two_images() -> FileDataset:
+    made = presentation_state()
+    made.ReferencedSeriesSequence[0].ReferencedImageSequence.append(reference("1.2.826.0.10"))
+    return made
+
+
+def report_of_loops() -> FileDataset:
+    """Every item below refers to the whole again."""
+    inner = [by_reference(1) for _ in range(40)]
+    return content(coordinates("POINT", list(TARGET), *inner))
+
+
+@pytest.mark.parametrize(
+    ("made", "why"),
+    [
+        (NO_FRAME_NO_IMAGE, "TARGET has no frame of reference and names no image"),
+        (in_images_frame("1.2.826.0.9", "9.9.9"), "on an image that is not in this case"),
+        (content(coordinates("POINT", list(TARGET))), "TARGET has no frame of reference"),
+        (in_display_units(), "TARGET is given in DISPLAY units"),
+        (over_two_images(), "TARGET is drawn on 2 images"),
+        (fiducial_on_image(reference(), reference("9.9")), "TARGET is drawn on 2 images"),
+        (fiducial_on_image(reference(ReferencedFrameNumber=[1, 2])), "TARGET is drawn on 2 frames"),
+        (fiducial_on_image(reference(), ShapeType="LINE"), "TARGET is a LINE, not a POINT"),
+        (content(coordinates("MULTIPOINT", [*TARGET, *ENTRY])), "TARGET is a MULTIPOINT of 6"),
+        (content(coordinates("POINT", [1.0, 2.0])), "TARGET is drawn on no image"),
+        (content(coordinates("POINT", [1.0, 2.0], by_reference(1, 7))), "drawn on no image"),
+        (report_of_loops(), "it is damaged"),
+    ],
+)
+def test_a_point_of_which_nobody_can_tell_where_it_is_is_refused_with_the_reason(desk, made, why):
+    body = noted(desk, made)
+    assert why in body.get("why", ""), body
+    assert "target_mm" not in body
+
+
+def test_a_point_on_a_slice_that_does_not_belong_to_the_case_is_refused(desk):
+    other = mr_data_set("1.2.826.0.77", began_s=time.time() - 1)
+    other.FrameOfReferenceUID = "1.2.826.0.55"
+    (row,) = desk.receive(other)
+    assert row.reason_code == "other_frame_of_reference"
+    assert "does not belong to this case" in noted(desk, presentation_state("1.2.826.0.77"))["why"]
+
+
+def test_a_word_beside_a_point_names_it_and_a_word_alone_needs_an_anchor(desk):
+    made = presentation_state()
+    target, entry = made.GraphicAnnotationSequence
+    target.GraphicLayer = "DRAWN"
+    target.TextObjectSequence = [item(UnformattedTextValue="TARGET 1")]
+    del entry.TextObjectSequence[0].AnchorPoint
+    body = noted(desk, made)
+    assert body["why"] == "its ENTRY is a text that points at nothing"
+    del made.GraphicAnnotationSequence[1]
+    made.SOPInstanceUID = made.file_meta.MediaStorageSOPInstanceUID = generate_uid()
+    assert noted(desk, made)["target_mm"] == pytest.approx(ON_SLICE)
+
+
 @pytest.mark.parametrize("place", [["a", "b", "c"], [1.0, 2.0], [1e308, 0, 0]])
 def test_a_damaged_plan_is_kept_and_set_aside_like_any_other_file(desk, place):
     made = spatial_fiducials(("TARGET", TARGET))

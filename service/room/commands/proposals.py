@@ -16,7 +16,6 @@ from service.procedure.scan_frame import newest_frame
 from service.room.commands.target import TargetCommands
 from service.room.context import RoomContext
 from service.room.proposals import (
-    MOST_OPEN,
     PROPOSED,
     REFUSED,
     SCAN_FRAME,
@@ -31,7 +30,9 @@ from service.room.proposals import (
     why_not_in_bore,
     why_other_frame,
     why_senseless,
+    why_too_many,
     why_void,
+    with_other_half,
 )
 from service.room.reach import OutOfReachError, ReachUnknownError, check_reach, entry_of
 from service.room.readiness import ConflictError
@@ -97,24 +98,34 @@ class ProposalCommands:
             frame_of_reference_uid=body.get("frame_of_reference_uid", ""),
         )
         if "why" in body:
-            told = {"sender": plan.sender, "name": plan.name, "via": plan.via, "why": body["why"]}
-            self._room.note(TURNED_AWAY, plan.sender, {**told, "received": event.event_id})
-            return
-        self.propose(plan, plan.sender, received=event.event_id)
+            self._turn_away(plan, plan.sender, body["why"], event.event_id)
+        else:
+            self.propose(plan, plan.sender, received=event.event_id)
+
+    def _turn_away(self, plan: Plan, by: str, why: str, received: int) -> None:
+        """Record it. To a storage command nobody answers why: of those the room says it."""
+        room = self._room
+        told = {"sender": plan.sender, "name": plan.name, "via": plan.via, "why": why}
+        with room.record.transaction():
+            room.note(TURNED_AWAY, by, {**told, "received": received})
+            if received:
+                text = f"plan {plan.name} ({plan.via}) from {plan.sender} was refused: {why}"
+                room.note("alarm", "", {"alarm": "plan_refused", "text": text})
 
     def propose(self, plan: Plan, by: str, received: int = 0) -> Verdict:
         """Record a plan for the operator to see, unless it cannot be one.
 
         received: the event by which it came, if it came by DICOM.
         """
+        self._withdraw_void()  # a half for where the table lay before joins no other
         known = self._book.update(self._room.record)
+        plan = with_other_half(plan, known)
         mine = [one for one in known if one.state == "open" and _same(one, plan)]
         if mine:
             return self._waiting(mine[0], reach_known=not mine[0].note)
         verdict = self._judge(plan, known)
         if verdict.code != "proposed":
-            told = {"sender": plan.sender, "name": plan.name, "via": plan.via, "why": verdict.text}
-            self._room.note(TURNED_AWAY, by, {**told, "received": received})
+            self._turn_away(plan, by, verdict.text, received)
             return verdict
         note = "" if verdict.reach_known else verdict.text
         body = {**_as_json(plan), "note": note, "received": received}
@@ -135,11 +146,8 @@ class ProposalCommands:
         )
         if why:
             return Verdict("invalid", why)
-        others = [one for one in known if one.state == "open" and one.sender != plan.sender]
-        if len(others) >= MOST_OPEN:
-            return Verdict(
-                "too_many", f"{len(others)} proposals are already waiting for the operator"
-            )
+        if why := why_too_many(plan, known):
+            return Verdict("too_many", why)
         if why := why_not_in_bore(plan):
             return Verdict("out_of_reach", why)
         try:
@@ -157,9 +165,12 @@ class ProposalCommands:
         one = self._open(number)
         room = self._room
         plan = Plan(one.sender, one.name, one.via, one.target_mm, one.entry_mm, one.direction)
-        why = why_other_frame(
-            one.frame_of_reference_uid, frame_of_reference(room.record)
-        ) or self._why_void(number)
+        here = frame_of_reference(room.record)
+        why = why_other_frame(one.frame_of_reference_uid, here) or self._why_void(number)
+        if one.frame_of_reference_uid and not here:
+            why = (
+                "whether the table has moved since it was planned is not known yet: acquire a slice"
+            )
         if why:
             raise ConflictError("other_frame", f"Not accepted: {why}.")
         try:
@@ -235,4 +246,5 @@ def _same(one: ProposalState, plan: Plan) -> bool:
 
 def _waits(one: ProposalState) -> str:
     note = f"; {one.note}" if one.note else ""
-    return f"proposal {one.number} is waiting for the operator{note}"
+    both = ", target and entry point as one plan" if one.apart else ""
+    return f"proposal {one.number} is waiting for the operator{both}{note}"
