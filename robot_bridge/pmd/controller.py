@@ -99,6 +99,8 @@ class PmdController:
         self.index_trapped = False  # it may have reset the count, or stopped the motor
         # One wrong bit makes `T0` (go to zero) of `U0`, but a harmless question of a bare `U`.
         self.status_body = "U"
+        self._answered: set[str] = set()
+        self._silent_to: set[str] = set()
         self._supply_due_s = 0.0
         self._asked_in_vain = False  # what an answer told that nobody heard, it does not tell again
 
@@ -137,20 +139,46 @@ class PmdController:
         return reply
 
     def ask_if_it_can(self, name: str, otherwise: str) -> Steps[Reply | None]:
-        """None, and a doubt for people to read, if this board does not answer that."""
-        try:
-            reply = yield from self.ask(name)
-        except PmdNoValueError:
-            reply = None
-        except PmdTimeoutError:
-            raise
-        except PmdError:
-            reply = None
+        """None, and a doubt for people to read, if this board does not answer that.
+
+        What it was silent to is not asked again; what it has answered before, it can.
+        """
+        reply = None
+        if name not in self._silent_to:
+            try:
+                reply = yield from self.ask(name)
+            except PmdTimeoutError as error:
+                if name in self._answered:
+                    raise
+                yield from self.must_live(error)
+                self._silent_to.add(name)
+            except PmdError:
+                pass
         if reply is None:
             self.doubts[name] = otherwise
             return None
+        self._answered.add(name)
         self.doubts.pop(name, None)
         return reply
+
+    def must_live(self, error: PmdTimeoutError) -> Steps[None]:
+        """A board that is silent to one question answers another; else it is the line, or dead."""
+        if isinstance(error, PmdNoValueError):
+            return
+        try:
+            yield from self.ask("E")
+        except PmdNoValueError:
+            pass
+        except PmdTimeoutError:
+            raise error from None
+        except PmdError:
+            pass
+
+    def begin_anew(self) -> None:
+        """Forget what it was seen to answer or not."""
+        self.doubts = {}
+        self._answered.clear()
+        self._silent_to.clear()
 
     def read_status(self) -> Steps[Status]:
         unheard, self._asked_in_vain = self._asked_in_vain, True

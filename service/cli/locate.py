@@ -39,13 +39,16 @@ def locate(
     path: Annotated[list[Path], typer.Argument(help="DICOM files or folders.")],
     shifts: Annotated[
         Path | None,
-        typer.Option(help="CSV file,row_px,col_px: localize one object from all files together."),
+        typer.Option(
+            help="CSV with the columns file,row_px,col_px: localize one object from all files "
+            "together."
+        ),
     ] = None,
     template: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file,row_px,col_px: learn the object's image from the files listed (beside "
-            "the CSV), and fit it in every file of PATH."
+            help="CSV with the columns file,row_px,col_px: learn the object's image from the files "
+            "listed (beside the CSV), and fit it in every file of PATH."
         ),
     ] = None,
     method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "ml",
@@ -264,14 +267,16 @@ def _of_size(
 
 
 def _row(one: Localization | Located, header: Slice, files: Sequence[Path]) -> dict[str, Any]:
-    sigma = np.sqrt(np.diag(one.covariance_px2))
+    common = np.zeros(2) if one.systematic_px is None else one.systematic_px
     patient_mm = geometry_of(header, files[0]).patient_from_pixel(one.centre_px)
     return {
         "row": float(one.centre_px[0]),
         "col": float(one.centre_px[1]),
         "radius_px": float(one.radius_px),
-        "sigma_row_px": float(sigma[0]),
-        "sigma_col_px": float(sigma[1]),
+        "sigma_row_px": float(one.sigma_px[0]),
+        "sigma_col_px": float(one.sigma_px[1]),
+        "systematic_row_px": float(common[0]),
+        "systematic_col_px": float(common[1]),
         "patient_mm": [float(value) for value in patient_mm],
         "snr": float(one.snr),
         "chi2_per_dof": float(one.chi2_per_dof),

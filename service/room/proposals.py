@@ -176,7 +176,9 @@ def why_void(record: CaseRecord, proposed: Event) -> str:
     Whether the sender says its frame of reference or not: it saw the slices of its time.
     """
     if proposed.seq <= calibration_good_since(record):
-        return "the table may have moved since, or the case was opened again; plan it again"
+        return (
+            "the table may have moved since, or the case was finished and continued; plan it again"
+        )
     frame = ScanFrame(**proposed.body.get(SCAN_FRAME, {}))
     other = other_place_since(record, proposed.seq, frame)
     if not other:

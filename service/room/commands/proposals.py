@@ -171,7 +171,7 @@ class ProposalCommands:
         why = why_other_frame(one.frame_of_reference_uid, here) or self._why_void(number)
         if one.frame_of_reference_uid and not here:
             why = (
-                "nobody can tell yet whether it is meant for the table as it lies: acquire a slice"
+                "whether the table has moved since it was planned is not known yet: acquire a slice"
             )
         if why:
             raise ConflictError("other_frame", f"Not accepted: {why}.")
