@@ -415,7 +415,7 @@ def _surplus(hold: HoldWindow, known: Sequence[Known]) -> Pending | Quarantined 
     there = _count(hold.hold_id, known)
     if there < hold.expected_slices:
         return None
-    text = f"hold {hold.hold_id} expects {hold.expected_slices} slices and has {there}"
+    text = f"hold {hold.hold_id} already has all its slices, {there} of {hold.expected_slices}"
     if hold.ended_at_s is None:
         return Pending(Reason.NOT_EXPECTED, text)
     return Quarantined(Reason.NOT_EXPECTED, text)

@@ -216,8 +216,8 @@ class ScannerClock:
         if not -rules.jump_tolerance_s <= since_start_s < length_s - rules.jump_tolerance_s:
             return ""
         return (
-            f"its duration of {length_s:.1f} s is wrong: it was here {max(0.0, since_start_s):.1f}"
-            " s after its start"
+            f"its duration of {length_s:.1f} s is wrong: it arrived "
+            f"{max(0.0, since_start_s):.1f} s after its start"
         )
 
     def by_comparison(self, slice_: Received, rules: ClockRules) -> OffsetBounds | None:
@@ -263,12 +263,13 @@ class ScannerClock:
     def _why_unknown(self, slice_: Received, rules: ClockRules) -> str:
         if rules.promptness is not None:
             return (
-                f"no {rules.witnesses} acquisitions arrived, each for itself, as promptly as was "
+                f"fewer than {rules.witnesses} separate acquisitions arrived as promptly as was "
                 "measured at this site"
             )
         if self.comparisons:
-            age_min = abs(slice_.received_s - self.comparisons[-1].at_s) / 60
-            return f"the clocks were compared {age_min:.0f} min away from it"
+            age_min = (slice_.received_s - self.comparisons[-1].at_s) / 60
+            when = "before" if age_min > 0 else "after"
+            return f"the clocks were compared {abs(age_min):.0f} min {when} it arrived"
         return "the clocks have not been compared"
 
 

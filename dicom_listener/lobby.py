@@ -16,7 +16,8 @@ import time
 from collections import Counter
 from dataclasses import dataclass
 
-_ASSOCIATE_RQ = 0x01
+from dicom_listener.network.conversation import ASSOCIATE_RQ, PDU_NAMES
+
 _HEAD_BYTES = 6
 _MOST_PEEKED_BYTES = 16 * 1024  # what the kernel keeps for us at the least; the rest comes later
 _NAP_S = 0.02
@@ -24,7 +25,14 @@ _STRANGERS_SHARE = 8
 
 
 class NoRequestError(OSError):
-    """There will be no association on this connection; the text says why."""
+    """There will be no association on this connection; the text says why.
+
+    is_dicom: whoever connected speaks the protocol; it is no health check that looks in and goes.
+    """
+
+    def __init__(self, why: str, *, is_dicom: bool = False) -> None:
+        super().__init__(why)
+        self.is_dicom = is_dicom
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,6 +84,7 @@ def await_request(connection: socket.socket, timeout_s: float) -> None:
     """Until a whole association request can be read. Raises NoRequestError; reads nothing."""
     until_s = time.monotonic() + timeout_s
     wanted = _HEAD_BYTES
+    head = b""
     poll = select.poll()
     poll.register(connection, select.POLLIN | select.POLLRDHUP)
     while True:
@@ -83,19 +92,25 @@ def await_request(connection: socket.socket, timeout_s: float) -> None:
         left_s = until_s - time.monotonic()
         ready = poll.poll(max(0.0, left_s) * 1000) if left_s > 0 else []
         if not ready:
-            raise NoRequestError(f"no association request within {timeout_s:g} s")
+            whole = "whole " if head else ""
+            raise NoRequestError(
+                f"no {whole}association request within {timeout_s:g} s", is_dicom=bool(head)
+            )
         head = connection.recv(wanted, socket.MSG_PEEK)
         if not head:
             raise NoRequestError("closed without sending anything")
-        if head[0] != _ASSOCIATE_RQ:
-            raise NoRequestError(f"not DICOM: first byte 0x{head[0]:02X}")
+        if head[0] != ASSOCIATE_RQ:
+            name = PDU_NAMES.get(head[0])
+            if name is None:
+                raise NoRequestError(f"not DICOM: first byte 0x{head[0]:02X}")
+            raise NoRequestError(f"{name} before any association request", is_dicom=True)
         if len(head) >= wanted > _HEAD_BYTES:
             break
         if len(head) >= _HEAD_BYTES:
             whole = _HEAD_BYTES + struct.unpack_from(">L", head, 2)[0]
             wanted = min(max(whole, _HEAD_BYTES + 1), _MOST_PEEKED_BYTES)
         if ready[0][1] & (select.POLLRDHUP | select.POLLHUP) and len(head) < wanted:
-            raise NoRequestError("closed within its association request")
+            raise NoRequestError("closed within its association request", is_dicom=True)
         if len(head) < wanted:
             time.sleep(_NAP_S)
     connection.setsockopt(socket.SOL_SOCKET, socket.SO_RCVLOWAT, 1)

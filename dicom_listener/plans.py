@@ -92,7 +92,7 @@ def _on_slice(record: CaseRecord, at: OnImage) -> Place:
     _check_ours(known)
     geometries = {_geometry(row) for row in known}
     if len(geometries) != 1:
-        raise _NoPlaceError("lies on an image of which two with the same UID are here")
+        raise _NoPlaceError("lies on an image whose UID is not unique in this case")
     x, y, z = geometries.pop().patient_from_pixel([at.row_px, at.col_px]).tolist()
     return (x, y, z), _frame_of(known)
 

@@ -14,6 +14,7 @@ import structlog
 
 from case_record.attempts import MOST_DEATHS, Attempts
 from case_record.cases import Cases
+from case_record.holding import FOLDER as HOLDING
 from case_record.presence import Presence, Sole
 from case_record.record import CaseRecord, CaseRecordError
 from dicom_listener.assign import AssignRules
@@ -161,7 +162,9 @@ def _commitment(config: ListenerConfig, cases: Cases) -> Commitment | None:
         return None
 
     def folders() -> list[Path]:
-        return [inbox_folder(home) for home in {cases.home, *cases.folders()}]
+        home = inbox_folder(cases.home)
+        inboxes = [inbox_folder(folder) for folder in cases.folders()]
+        return [home, cases.home / HOLDING, *(one for one in inboxes if one != home)]
 
     places = {
         title: (place.rpartition(":")[0], int(place.rpartition(":")[2]))

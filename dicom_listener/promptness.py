@@ -87,7 +87,7 @@ def promptness_of(delays_s: Sequence[float]) -> Promptness:
     the range alone with a probability of 19/21.
     """
     if len(delays_s) < FEWEST_DELAYS:
-        raise TooFewDelaysError(f"{len(delays_s)} delays; at least {FEWEST_DELAYS} are needed")
+        raise TooFewDelaysError(f"at least {FEWEST_DELAYS} delays are needed, got {len(delays_s)}")
     least_s, most_s = min(delays_s), max(delays_s)
     margin_s = (most_s - least_s) / 2 + _MARGIN_S
     return Promptness(max(0.0, least_s - margin_s), most_s + margin_s)

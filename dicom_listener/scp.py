@@ -19,6 +19,7 @@ import structlog
 from pydicom.dataset import Dataset
 from pynetdicom import AE, _config, evt
 from pynetdicom.association import Association
+from pynetdicom.dimse_primitives import C_CANCEL
 from pynetdicom.events import Event
 from pynetdicom.sop_class import StorageCommitmentPushModel
 
@@ -34,8 +35,12 @@ from dicom_listener.negotiation import (
     report_of,
 )
 from dicom_listener.network.commitment import Commitment
-from dicom_listener.network.endings import ending_of
-from dicom_listener.network.store_request import mend_store_request, uid_sent_under
+from dicom_listener.network.endings import Ending, ending_of, who_of
+from dicom_listener.network.store_request import (
+    UnanswerableError,
+    mend_store_request,
+    uid_sent_under,
+)
 from dicom_listener.transport import BoundedSocket, PromptServer
 from dicom_slice.preflight import NoDataSetError, peek
 from room_config.networks import address_of
@@ -175,6 +180,7 @@ class Scp:
             "most_associations": rules.max_associations,
             "is_known": staticmethod(self._is_known),
             "on_dropped": staticmethod(self._on_dropped),
+            "on_no_request": staticmethod(self._on_no_request),
             "on_ended": staticmethod(self._on_ended),
         }
         return type("RoomServer", (PromptServer,), settings)
@@ -183,16 +189,24 @@ class Scp:
 
     def _on_ended(self, association: Association) -> None:
         ending = ending_of(association)
-        if ending is None or self._is_stopping:
+        if ending is not None:
+            self._tell(ending, association.requestor.port)
+
+    def _tell(self, ending: Ending, port: int | None = None) -> None:
+        if self._is_stopping:
             return
         self._metrics.endings.labels(ending.kind).inc()
         if ending.is_release:
             log.debug("association ended", text=ending.text)
         else:
             self._metrics.alarms.labels("association_ended").inc()
-            log.warning("association_ended", text=ending.text, port=association.requestor.port)
+            log.warning("association_ended", text=ending.text, port=port)
             if self._is_news("association_ended", ending.text):
                 self.alarms.append(("association_ended", ending.text))
+
+    def _on_no_request(self, peer: str, why: str) -> None:
+        self._metrics.dropped.inc()
+        self._tell(Ending("no_request", f"connection of {peer}: {why}"))
 
     def _on_dropped(self, peer: str, why: str) -> None:
         self._metrics.dropped.inc()
@@ -251,7 +265,6 @@ class Scp:
             self._say("contexts_refused", report.matters)
         if self._is_news("association", text):
             log.info("association", text=text)
-        event.assoc.dul.socket.message_done()
 
     def _on_rejected(self, event: Event) -> None:
         code = event.assoc.acceptor.primitive
@@ -268,13 +281,23 @@ class Scp:
     def _on_message(self, event: Event) -> None:
         """Before pynetdicom makes anything of it, in its thread."""
         association, message = event.assoc, event.message
+        sock = association.dul.socket
         try:
             context = association._accepted_cx.get(message.context_id)
             syntax = str(context.transfer_syntax[0]) if context else ""
             mend_store_request(message, syntax)
-            message.message_to_primitive()
+            primitive = message.message_to_primitive()
+            if isinstance(primitive, C_CANCEL):
+                sock.message_done()
+                text = f"{who_of(association)}: a C-CANCEL; there is nothing to cancel"
+                self._alarm("message_ignored", text)
+            elif primitive.is_valid_response:
+                sock.message_done()  # somebody waits for it
+            elif not primitive.is_valid_request:
+                raise UnanswerableError("its message ID, SOP class or status is missing")
         except Exception as error:
-            association.dul.socket.note_ending("unreadable", f"an unreadable message: {error}")
+            sock.message_done()
+            sock.note_ending("unreadable", f"an unreadable message: {error}")
             association.dul.event_queue.put("Evt19")
 
     def _on_echo(self, event: Event) -> int:

@@ -13,24 +13,27 @@ import selectors
 import socket
 import ssl
 import time
+from collections import deque
 from collections.abc import Callable
 from socketserver import TCPServer
 from typing import Any
 
+import structlog
 from pynetdicom import evt
 from pynetdicom.association import Association
 from pynetdicom.events import Event
-from pynetdicom.pdu import A_ABORT_RQ
+from pynetdicom.pdu import A_ABORT_RQ, A_ASSOCIATE_RJ
 from pynetdicom.timer import Timer
 from pynetdicom.transport import AssociationSocket, RequestHandler, ThreadedAssociationServer
 
 from dicom_listener.lobby import Lobby, NoRequestError, await_request
-from dicom_listener.network.association_request import ASSOCIATE_RQ, mended_request
+from dicom_listener.network.hearing import Hearing
+
+log = structlog.get_logger("listener")
 
 _QUICKACK = getattr(socket, "TCP_QUICKACK", None)
 _CHUNK_BYTES = 256 * 1024
 _MAY_BE_SILENT_S = 2.0
-_ABORT = 0x07
 
 
 def acknowledge_at_once(sock: socket.socket) -> None:
@@ -56,6 +59,8 @@ class BoundedSocket(AssociationSocket):
         self.message_bytes = 0
         self.unfinished_bytes = 0
         self.message_began_s: float | None = None
+        self._before_pdu: tuple[int, float | None] = (0, None)
+        self._began_whole_s: deque[float | None] = deque()  # of messages not answered yet
         self.heard_s = time.monotonic()
         self.why_ended: tuple[str, str] | None = None  # (kind, in words)
         self.is_accounted_for = False
@@ -65,11 +70,29 @@ class BoundedSocket(AssociationSocket):
         if self.why_ended is None:
             self.why_ended = kind, why
 
-    def message_done(self) -> float | None:
-        """Start counting anew; return the monotonic instant of the message's first byte."""
-        began_s, self.message_began_s = self.message_began_s, None
+    @property
+    def unanswered(self) -> int:
+        """How many messages were received whole and are not dealt with yet."""
+        return len(self._began_whole_s)
+
+    def pdu_begins(self) -> None:
+        self._before_pdu = self.unfinished_bytes, self.message_began_s
+
+    def pdu_is_no_message(self) -> None:
+        """What has just been read is no part of a message, but beside or between messages."""
+        self.unfinished_bytes, self.message_began_s = self._before_pdu
+        if self.message_began_s is None:
+            self.message_bytes = 0
+
+    def message_whole(self) -> None:
+        """With what has just been read a message is whole; start counting again."""
+        self._began_whole_s.append(self.message_began_s)
         self.message_bytes = self.unfinished_bytes = 0
-        return began_s
+        self.message_began_s = None
+
+    def message_done(self) -> float | None:
+        """One is dealt with; return the monotonic instant of its first byte."""
+        return self._began_whole_s.popleft() if self._began_whole_s else None
 
     def recv(self, nr_bytes: int) -> bytearray:
         sock = self.socket
@@ -92,6 +115,11 @@ class BoundedSocket(AssociationSocket):
             if len(received) < nr_bytes and time.monotonic() > deadline_s:
                 self._refuse(f"a PDU took longer than {self.pdu_deadline_s:g} s")
         return received
+
+    def discard(self) -> None:
+        """Read what is there, and drop it. Raises OSError where the peer is gone."""
+        if self.socket is None or not self.socket.recv(_CHUNK_BYTES):
+            raise ConnectionError("the connection is closed")
 
     def _next_piece(self, sock: socket.socket, nr_bytes: int) -> bytes:
         try:
@@ -197,45 +225,33 @@ class PromptRequestHandler(RequestHandler):
         def account() -> None:
             server.on_ended(association)
 
-        dul._decode_pdu = _tolerant(dul._decode_pdu, bounded, account)
-        association.run = _accounted(association.run, account)
+        Hearing(association, bounded, account)
+        dul.run = _caught(dul.run, bounded)
+        association.run = _accounted(_caught(association.run, bounded), account)
         association.bind(evt.EVT_PDU_SENT, _stop_waiting)
         return association
 
 
-def _tolerant(
-    decode: Callable[[bytearray], Any], sock: BoundedSocket, account: Callable[[], None]
-) -> Callable[..., Any]:
-    """pynetdicom's decoding of a PDU, which says why where it cannot, and takes what DCMTK takes.
-
-    What cannot be converted is found here, too: later, it would end the thread and nothing else.
-    The account is given at once: the thread may wait for a while for the peer to go.
-    """
-
-    def decode_tolerantly(stream: bytearray) -> Any:
-        try:
-            if stream[0] == ASSOCIATE_RQ:
-                mended = mended_request(bytes(stream))
-                sock.remarks = tuple(mended.remarks)
-                stream = bytearray(mended.pdu)
-            pdu, event = decode(stream)
-            if stream[0] == ASSOCIATE_RQ:
-                pdu.to_primitive()
-            if stream[0] == _ABORT:
-                sock.note_ending("aborted", "aborted by the sender")
-        except Exception as error:
-            sock.note_ending("unreadable", f"an unreadable PDU: {error}")
-            account()
-            raise
-        return pdu, event
-
-    return decode_tolerantly
-
-
 def _stop_waiting(event: Event) -> None:
-    """Where the request was answered by an abort, the association need not wait for it any more."""
-    if isinstance(event.pdu, A_ABORT_RQ) and event.assoc.requestor.primitive is None:
+    """Where the request was answered by its end, the association need not wait for it any more."""
+    if (
+        isinstance(event.pdu, (A_ABORT_RQ, A_ASSOCIATE_RJ))
+        and event.assoc.requestor.primitive is None
+    ):
         event.assoc.dul.to_user_queue.put(None)
+
+
+def _caught(run: Callable[[], None], sock: BoundedSocket) -> Callable[[], None]:
+    """A thread of an association; what nobody has foreseen ends the association with a reason."""
+
+    def run_to_the_end() -> None:
+        try:
+            run()
+        except Exception as error:
+            sock.note_ending("internal_error", f"ended by an error here ({error!r})")
+            log.debug("the thread of an association", exc_info=True)
+
+    return run_to_the_end
 
 
 def _accounted(run: Callable[[], None], account: Callable[[], None]) -> Callable[[], None]:
@@ -264,6 +280,7 @@ class PromptServer(ThreadedAssociationServer):
     most_associations = 16
     is_known: Callable[[str], bool] = staticmethod(lambda peer: True)
     on_dropped: Callable[[str, str], None] = staticmethod(lambda peer, why: None)
+    on_no_request: Callable[[str, str], None] = staticmethod(lambda peer, why: None)
     on_ended: Callable[[Association], None] = staticmethod(lambda association: None)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
@@ -308,7 +325,7 @@ class PromptServer(ThreadedAssociationServer):
                 await_request(sock, self.first_byte_timeout_s)
             sock.settimeout(self.message_timeout_s)
         except NoRequestError as error:
-            self.on_dropped(peer, str(error))
+            (self.on_no_request if error.is_dicom else self.on_dropped)(peer, str(error))
             self.shutdown_request(sock)
             return None
         except OSError as error:  # TLS errors and timeouts are OSErrors too

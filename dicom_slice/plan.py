@@ -258,7 +258,7 @@ def _values(item: Dataset) -> list[Any]:
 
 def _in_space(label: str, data: Any, frame: str, images: tuple[str, ...]) -> PlanPoint:
     if len(data) != 3:
-        return PlanPoint(label, why=f"has {len(data)} coordinates, not three")
+        return PlanPoint(label, why=f"needs three coordinates, has {len(data)}")
     x, y, z = (float(value) for value in data)
     return PlanPoint(label, (x, y, z), frame, images=() if frame else images)
 

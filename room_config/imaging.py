@@ -30,7 +30,8 @@ class PointSpreadConfig(Section):
         wanted = _PARAMETERS[self.kind]
         if self.parameters and len(self.parameters) != wanted:
             raise ValueError(
-                f"{self.kind} takes {wanted} parameters, {len(self.parameters)} are given"
+                f"{self.kind} takes {wanted} parameter{'s' * (wanted != 1)}, got "
+                f"{len(self.parameters)}"
             )
         return self
 

@@ -70,7 +70,7 @@ def check_shifts(shifts_px: ArrayLike, count: int | None = None) -> NDArray[np.f
         bad = int(np.flatnonzero(~np.isfinite(shifts).all(axis=1))[0])
         raise NotFiniteError(f"shifts_px[{bad}] is not finite: {tuple(shifts[bad].tolist())}")
     if count is not None and len(shifts) != count:
-        raise ShapeError(f"{count} frames but {len(shifts)} shifts")
+        raise ShapeError(f"one shift per frame is needed: frames {count}, shifts {len(shifts)}")
     return shifts
 
 

@@ -94,9 +94,7 @@ def locate_all(
         except EngineError as error:
             refusals.append(str(error))
     if not found:
-        raise NoRoundObjectError(
-            f"{len(refusals)} round objects seen, but none fits: {refusals[0]}"
-        )
+        raise NoRoundObjectError(f"no round object fits ({len(refusals)} seen): {refusals[0]}")
     return found
 
 

@@ -53,7 +53,8 @@ class Psf:
         wanted = len(_DEFAULTS[self.kind])
         if len(self.parameters) != wanted or not np.all(np.isfinite(self.parameters)):
             raise ParameterError(
-                f"psf '{self.kind}' takes {wanted} finite parameters, got {self.parameters}"
+                f"psf '{self.kind}' takes {wanted} finite parameter{'s' * (wanted != 1)}, "
+                f"got {self.parameters}"
             )
         if not all(0 < fraction <= 1 for fraction in self.acquired):
             raise ParameterError(f"psf acquired fraction must be in (0, 1], is {self.acquired}")

@@ -122,7 +122,7 @@ def localize_request(
     if learnt is not None and not why_not:
         return Found(_found_by_template(frames, request, learnt), learnt)
     if learnt is not None:
-        why_not = f"these slices have {why_not}, which takes another template: calibrate again"
+        why_not = f"these slices have {why_not}, which needs another template: calibrate again"
     try:
         disc = _found_as_disc(frames, "ml", request, psf)
     except _BUT_NO_DISC as error:
@@ -170,8 +170,8 @@ def _found_by_template(frames: Frames, request: Mapping[str, Any], learnt: Learn
     except (TemplateMismatchError, NoRoundObjectError, NotConvergedError) as error:
         raise TemplateMismatchError(
             f"{error}: the fiducial does not look as in the slices of the calibration. Take the "
-            "slice again; if it stays so (a bubble has moved, the slice lies elsewhere), calibrate "
-            "again"
+            "slice again; if that does not help (a bubble has moved, the slice lies elsewhere), "
+            "calibrate again"
         ) from error
     _refuse_outside(found, expected_px, gate_px, mean_mm)
     return found
@@ -330,7 +330,7 @@ def _whole_pixels(
     if r1 <= r0 or c1 <= c0:
         raise ObjectAtBorderError(
             f"rows {r0} to {r1}, columns {c0} to {c1}, where the fiducial is looked for, lie "
-            f"outside of the {rows} x {cols} slice"
+            f"outside the {rows} x {cols} slice"
         )
     return r0, c0, r1, c1
 

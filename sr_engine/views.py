@@ -101,14 +101,14 @@ class Templates:
 
 def _learnt(views: Sequence[View], radius_px: tuple[float, float]) -> Learnt:
     if not views:
-        raise TemplateError("no measurement is named that a template could be learnt from")
+        raise TemplateError("no measurement was named to learn a template from")
     if any(row.header.get("kind") == _CAMERA for view in views for row in view.frames.slices):
         # its pixels fold what is finer than they are: sigma would be too small (by a quarter)
-        raise TemplateError("images of a camera are not band-limited, as a template presumes")
+        raise TemplateError("a template needs band-limited images, and a camera's are not")
     for view in views[1:]:
         if other := why_unlike(views[0].frames, view.frames):
             raise TemplateError(
-                f"measurement {view.measurement_id} is of slices with {other}: not of one protocol"
+                f"measurement {view.measurement_id} has slices with {other}: not the same protocol"
             )
     pixels = np.concatenate([view.frames.pixels for view in views])
     places = np.concatenate([view.reference_px + view.frames.shifts_px for view in views])

@@ -217,11 +217,13 @@ def view_of(record: CaseRecord, number: int) -> View:
     """An earlier measurement as a template is learnt from it: by the record, now and later."""
     row = record.measurement(number)
     if row.result is None:
-        raise TemplateError(f"measurement {number}, of which the template is learnt, has no result")
+        raise TemplateError(
+            f"measurement {number}, which the template is learnt from, has no result"
+        )
     set_aside = UnusableSlicesError(
         "no_slices",
-        f"a slice of measurement {number}, of which the template is learnt, was set aside "
-        "since: calibrate again",
+        f"a slice of measurement {number}, which the template is learnt from, has since been "
+        "set aside: calibrate again",
     )
     try:
         frames = frames_then(gather_frames(record, row), row)

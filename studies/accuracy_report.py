@@ -24,7 +24,7 @@ fit of `sr_engine.locate.refine`: disc with or without a wall, through the likel
 of point spreads, one for each group. The others, at settings of our choosing, are described in
 `studies/peers.py`.
 
-What to hold against these figures: the short list of point spreads and the limit for outliers in
+What weakens these figures: the short list of point spreads and the limit for outliers in
 `sr_engine.locate` were chosen among five variants by their scatter in about half of these very
 groups, so ours is somewhat flattered; the other methods were not tuned in this way. The known
 displacements act on magnitudes, not on the scanner's complex data. Many groups are a single pair.
@@ -48,7 +48,7 @@ slow drift is left out; of several objects the median.
 answers in whole or half pixels (OpenCV, scikit-image) repeats to 0 while it is wrong by up to half
 a pixel; those are left out of "best other" here, and by their bare figures would win. *Displaced*:
 every slice moved by a known random part of a pixel first, by a phase on its k-space,
-and the answer less that: what the robot does
+that part then subtracted from the answer: what the robot does
 with the fiducial. Here all count.
 
 | group | kind | slices | objects | ours, as taken | best other | ours, displaced | best other |
@@ -57,8 +57,8 @@ with the fiducial. Here all count.
 GEOMETRY = """## Geometric accuracy
 
 The 14 vials of one plate design, as three scanners see them. Each scan's vials (median over its
-slices) are laid by a similarity over the consensus of the *other* scanners, by the same method, and
-over the drawing. The drawing is not the truth: plates are built to about half a millimetre.
+slices) are fitted by a similarity to the consensus of the *other* scanners, by the same method, and
+to the drawing. The drawing is not the truth: plates are built to about half a millimetre.
 
 | scan | method | vials | consensus mm | drawing mm |
 |---|---|---:|---:|---:|"""
@@ -155,7 +155,7 @@ def lost_groups(rows: list[dict[str, Any]]) -> str:
 
 def reason(row: dict[str, Any], ours: float | None, better: dict[str, float], key: str) -> str:
     names = ", ".join(f"{n} {v:.4f}" for n, v in sorted(better.items(), key=lambda i: i[1]))
-    text = f"`{row['group']}`: ours {px(ours)}, less: {names}. "
+    text = f"`{row['group']}`: ours {px(ours)}, smaller: {names}. "
     if ours is None:
         return text + "Ours failed in too many slices."
     pairs = row["slices"] - 1
@@ -169,13 +169,14 @@ def reason(row: dict[str, Any], ours: float | None, better: dict[str, float], ke
     if mine is None:
         return text + "."
     shown = ", ".join(f"{n} {v:.4f}" for n, v in sorted(others.items(), key=lambda i: i[1]))
-    text += f"; less that motion ours scatters by {mine:.4f}, {shown or 'the others not at all'}. "
+    text += f"; with that motion subtracted, ours scatters by {mine:.4f}, "
+    text += f"{shown or 'the others not at all'}. "
     if all(mine <= value for value in others.values()):
-        text += "Ours is the least then: it follows a motion that the others see in part."
+        text += "Ours is then the smallest: it follows a motion that the others see only in part."
     elif mine < 0.5 * ours:
         text += "Most of ours is that motion."
     else:
-        text += "Motion does not explain it: the fit itself is the worse here."
+        text += "Motion does not explain it: here the fit itself is worse."
     return text
 
 
@@ -194,8 +195,8 @@ def _why(ours: dict[str, Any], better: list[dict[str, Any]]) -> str:
     texts = []
     for other in better:
         text = (
-            f"Less: {other['method']} {other['consensus_mm']:.3f}. Vial by vial the two residuals "
-            f"are alike (correlation {other['like_ours']:.2f})"
+            f"Smaller: {other['method']} {other['consensus_mm']:.3f}. Vial by vial the two "
+            f"residuals are alike (correlation {other['like_ours']:.2f})"
         )
         if ours["again_mm"] is not None and other["again_mm"] is not None:
             text += (
@@ -205,8 +206,8 @@ def _why(ours: dict[str, Any], better: list[dict[str, Any]]) -> str:
             )
             if ours["again_mm"] < other["again_mm"]:
                 text += (
-                    ". So the residual is for the most part the plate's and the gradients', and "
-                    "the other's larger error of its own happens to make it less here"
+                    ". So most of the residual comes from the plate and the gradients, and the "
+                    "other method's larger error of its own happens to reduce it here"
                 )
         texts.append(text + ".")
     return " ".join(texts)

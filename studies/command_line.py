@@ -75,7 +75,9 @@ def numerical(
 def benchtop(
     trials: Annotated[
         int | None,
-        typer.Option(help="Punctures per strategy: 140, in rooms of 14; with --room 14."),
+        typer.Option(
+            help="Punctures per strategy (default: 140, in rooms of 14; with --room: 14)."
+        ),
     ] = None,
     seed: Annotated[
         int, typer.Option(help="Seed of every random draw; the same seed gives the same numbers.")

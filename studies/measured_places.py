@@ -44,7 +44,7 @@ def read_places(
     if not source.is_dir():
         return _of_csv(source, strategies, punctures)
     if px_per_mm is None:
-        raise ValueError(f"{source}: the scale of the photos is not known: --px-per-mm")
+        raise ValueError(f"{source}: the scale of the photos is not known: give --px-per-mm")
     return {
         name: holes_of(_photo(source, name), px_per_mm, punctures, hole_mm) for name in strategies
     }
@@ -55,7 +55,7 @@ def _of_csv(path: Path, strategies: Sequence[str], punctures: int) -> dict[str, 
     with path.open(newline="", encoding="utf-8-sig") as file:
         rows = csv.DictReader(file)
         if set(COLUMNS) - set(rows.fieldnames or ()):
-            raise ValueError(f"{path}: the columns {', '.join(COLUMNS)} are wanted")
+            raise ValueError(f"{path}: needs the columns {', '.join(COLUMNS)}")
         for row in rows:
             where = f"{path}, line {rows.line_num}"
             try:
@@ -103,8 +103,8 @@ def holes_of(
                 holes.append(refine(grey, one, psf))
     if len(holes) != count:
         raise ValueError(
-            f"{photo}: {len(holes)} holes found where {count} punctures were made; crop it to the "
-            "sheet, set --hole-mm, or measure into the CSV what lies over each other"
+            f"{photo}: holes found: {len(holes)}, punctures made: {count}; crop it to the sheet, "
+            "set --hole-mm, or measure overlapping holes by hand and give a CSV"
         )
     rows_cols = np.array([one.centre_px for one in holes])
     return np.asarray(rows_cols[:, ::-1] / px_per_mm)

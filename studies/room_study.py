@@ -42,7 +42,9 @@ class Asked:
         names = [name.strip() for name in self.strategies.split(",")]
         for name in names:
             if name not in STRATEGY_NAMES or names.count(name) > 1:
-                raise ValueError(f"--strategies: {name!r}; {', '.join(STRATEGY_NAMES)}, each once")
+                raise ValueError(
+                    f"--strategies: {name!r}: use each once, of {', '.join(STRATEGY_NAMES)}"
+                )
         return names
 
 
@@ -50,7 +52,7 @@ def run_in_room(room: Path, out: Path, asked: Asked, *, as_json: bool) -> None:
     """Go on with the study in `out`; ValueError, OSError, StudyEndedError."""
     names = asked.names
     if not 3 <= asked.punctures <= _MOST_PUNCTURES:
-        raise ValueError(f"--trials is {asked.punctures}; 3 to {_MOST_PUNCTURES} are possible")
+        raise ValueError(f"--trials is {asked.punctures}; allowed: 3 to {_MOST_PUNCTURES}")
     if not 0 < asked.hole_mm[0] < asked.hole_mm[1] or (asked.px_per_mm or 1) <= 0:
         raise ValueError("--hole-mm and --px-per-mm must be positive, the larger radius last")
     try:

@@ -101,7 +101,9 @@ class Log:
         for name in ("room", "strategies", "punctures", "seed"):
             was, wanted = getattr(self._study, name), getattr(study, name)
             if was != wanted:
-                raise ValueError(f"{self._path} is of {name} {was}, not {wanted}: another --out")
+                raise ValueError(
+                    f"{self._path}: a study with {name} {was}, not {wanted}: use another --out"
+                )
         return self._study
 
     def add(self, made: Made) -> None:
@@ -155,8 +157,8 @@ class RoomTrials:
     def _trial(self, strategy: str) -> None:
         if not self._log.of(strategy):
             self._ask(
-                f"{strategy}: fix a new sheet under the robot and make sure that it may move; it "
-                "is driven from now on."
+                f"{strategy}: fix a new sheet under the robot and make sure that the robot may "
+                "move; it will move from now on."
             )
             self._start(strategy)
         while (number := len(self._log.of(strategy))) < self._study.punctures:

@@ -9,10 +9,9 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 
-ASSOCIATE_RQ = 0x01
 BLANK = "(BLANK)"
 _HEAD_BYTES = 74  # type to the reserved bytes before the first item
-_CALLED, _CALLING = slice(10, 26), slice(26, 42)
+_VERSION, _CALLED, _CALLING = slice(6, 8), slice(10, 26), slice(26, 42)
 _CONTEXT, _USER_INFORMATION = 0x20, 0x50
 _CLASS_UID, _VERSION_NAME = 0x52, 0x55
 _KNOWN_USER_ITEMS = range(0x51, 0x5A)
@@ -40,12 +39,19 @@ def mended_request(pdu: bytes) -> Mended:
         raise MalformedRequestError(f"an association request of {len(pdu)} bytes")
     mended = Mended()
     head = bytearray(pdu[:_HEAD_BYTES])
+    if speaks_our_version(pdu):
+        head[_VERSION] = b"\0\1"
     head[_CALLED] = _padded(readable_ae_title(bytes(head[_CALLED])))
     head[_CALLING] = _padded(readable_ae_title(bytes(head[_CALLING])))
     items = b"".join(_mended_items(pdu, mended))
     mended.pdu = bytes(head[:2]) + struct.pack(">L", len(head) - 6 + len(items))
     mended.pdu += bytes(head[6:]) + items
     return mended
+
+
+def speaks_our_version(pdu: bytes) -> bool:
+    """Whether version 1 of the protocol is among those that the sender speaks (one bit each)."""
+    return bool(pdu[_VERSION.stop - 1] & 1)
 
 
 def readable_ae_title(raw: bytes) -> str:

@@ -5,7 +5,6 @@ report goes out on the same association where that still stands, else on a new o
 configuration says that the asking AE listens.
 """
 
-import contextlib
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -29,45 +28,65 @@ REQUEST = 1
 _ALL_SAFE, _SOME_FAILED = 1, 2
 _NO_SUCH_INSTANCE, _CLASS_CONFLICT = 0x0112, 0x0119
 _NO_SUCH_ACTION, _INVALID = 0x0123, 0x0115
+_LOOK_AGAIN_S = 0.5
 _REPORT_AFTER_S = 0.1  # the answer to the request goes out first
 
 log = structlog.get_logger("listener")
 
 
 class KeptInstances:
-    """What lies in the inboxes, by SOP Instance UID; looked up anew for files that are new."""
+    """What lies in the folders, by SOP Instance UID; only files that are new are looked into.
+
+    An instance may lie in several files: one that was sent twice does, until it is decided. Files
+    are moved from folder to folder; `folders` names those first from which they come.
+    """
 
     def __init__(self, folders: Callable[[], Sequence[Path]]) -> None:
         self._folders = folders
-        self._paths: dict[str, tuple[str, Path]] = {}  # UID: class, file
-        self._known: set[str] = set()
+        self._classes: dict[str, dict[Path, str]] = {}  # UID: file: SOP class
+        self._known: set[Path] = set()
         self._lock = threading.Lock()
 
     def problem(self, sop_class: str, uid: str) -> int | None:
         """The failure reason (PS3.3 C.14) of an instance that is not safe here; None: it is."""
-        for _ in range(2):  # a file goes from the room's inbox to its case, once
-            with self._lock:
-                self._look()
-                kept = self._paths.get(uid)
-            if kept is None:
-                return _NO_SUCH_INSTANCE
-            with contextlib.suppress(FileNotFoundError):
-                if not is_whole(kept[1]):
-                    return _NO_SUCH_INSTANCE
-                return None if kept[0] == sop_class else _CLASS_CONFLICT
-        return _NO_SUCH_INSTANCE
+        with self._lock:
+            self._look()
+            kept = list(self._classes.get(uid, {}).items())
+        problem = _NO_SUCH_INSTANCE
+        for path, kind in kept:
+            try:
+                if not is_whole(path):
+                    continue
+            except FileNotFoundError:
+                self._forget(uid, path)
+                continue
+            except (OSError, NotFromInboxError):
+                continue
+            if kind == sop_class:
+                return None
+            problem = _CLASS_CONFLICT
+        return problem
 
     def _look(self) -> None:
         for folder in self._folders():
             for path in folder.glob("*.dcm"):
-                if str(path) in self._known:
+                if path in self._known:
                     continue
-                self._known.add(str(path))
+                self._known.add(path)
                 try:
                     envelope, _ = read_envelope(path)
+                except FileNotFoundError:
+                    self._known.discard(path)
                 except (OSError, NotFromInboxError):
                     continue
-                self._paths[envelope.sop_instance_uid] = envelope.sop_class_uid, path
+                else:
+                    classes = self._classes.setdefault(envelope.sop_instance_uid, {})
+                    classes[path] = envelope.sop_class_uid
+
+    def _forget(self, uid: str, path: Path) -> None:
+        with self._lock:
+            self._classes.get(uid, {}).pop(path, None)
+            self._known.discard(path)
 
 
 @dataclass
@@ -95,14 +114,21 @@ class Commitment:
         """(event type, event information): which of the instances are safe, which are not."""
         report = Dataset()
         report.TransactionUID = asked.TransactionUID
-        safe, failed = [], []
-        for item in asked.ReferencedSOPSequence:
-            one = Dataset()
-            one.ReferencedSOPClassUID = item.get("ReferencedSOPClassUID", "")
-            one.ReferencedSOPInstanceUID = item.get("ReferencedSOPInstanceUID", "")
-            problem = self.kept.problem(
-                str(one.ReferencedSOPClassUID), str(one.ReferencedSOPInstanceUID)
+        named = [
+            (
+                str(item.get("ReferencedSOPClassUID", "")),
+                str(item.get("ReferencedSOPInstanceUID", "")),
             )
+            for item in asked.ReferencedSOPSequence
+        ]
+        problems = [self.kept.problem(*names) for names in named]
+        if any(problems):  # a file that was just being moved is found at the second look
+            time.sleep(_LOOK_AGAIN_S)
+        safe, failed = [], []
+        for names, found in zip(named, problems, strict=True):
+            one = Dataset()
+            one.ReferencedSOPClassUID, one.ReferencedSOPInstanceUID = names
+            problem = found and self.kept.problem(*names)
             if problem is None:
                 safe.append(one)
             else:

@@ -8,9 +8,6 @@ ends, however it does, the account is made from that.
 from dataclasses import dataclass
 from typing import Any
 
-# more than this of a message was there: the slice that it would have been is missed
-_BEGUN_BYTES = 16
-
 
 @dataclass(frozen=True)
 class Ending:
@@ -30,13 +27,19 @@ def ending_of(association: Any) -> Ending | None:
     if association.is_rejected or sock.is_accounted_for:
         return None
     sock.is_accounted_for = True
-    who = _who(association)
+    who = who_of(association)
+    lost = _lost(sock)
     if association.is_released:
-        return Ending("released", f"{who}: released")
+        return Ending("unfinished" if lost else "released", f"{who}: released{lost}")
     kind, why = sock.why_ended or _by_state(association)
-    if association.requestor.primitive is not None and sock.unfinished_bytes > _BEGUN_BYTES:
-        why += f", in the middle of a message ({sock.unfinished_bytes} bytes of it had arrived)"
-    return Ending(kind, f"{who}: {why}")
+    return Ending(kind, f"{who}: {why}{lost if association.requestor.primitive else ''}")
+
+
+def _lost(sock: Any) -> str:
+    """What ends with the association: the slice that it would have been is missed."""
+    if sock.unfinished_bytes > 0:
+        return f", in the middle of a message ({sock.unfinished_bytes} bytes of it had arrived)"
+    return ", before its message was answered" if sock.unanswered else ""
 
 
 def _by_state(association: Any) -> tuple[str, str]:
@@ -47,7 +50,8 @@ def _by_state(association: Any) -> tuple[str, str]:
     return "broken", "the connection was lost"
 
 
-def _who(association: Any) -> str:
+def who_of(association: Any) -> str:
+    """The peer, in words."""
     request = association.requestor.primitive
     peer = association.requestor.address
     if request is None:

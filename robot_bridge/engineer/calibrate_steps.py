@@ -101,7 +101,7 @@ def _check_reading(axis: str, number: int, sign: int, reading: StepReading) -> N
 def _one_direction(axis: str, direction: str, readings: Sequence[StepReading]) -> StepLength:
     if len(readings) < MIN_READINGS:
         raise CalibrationError(
-            f"axis {axis}: {len(readings)} readings {direction}, at least {MIN_READINGS} needed"
+            f"axis {axis}: at least {MIN_READINGS} readings {direction} needed, got {len(readings)}"
         )
     step_um = sum(abs(r.moved_um) for r in readings) / sum(abs(r.steps) for r in readings)
     singles_um = [abs(r.moved_um / r.steps) for r in readings]

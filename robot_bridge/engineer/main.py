@@ -53,7 +53,7 @@ def _parser() -> argparse.ArgumentParser:
         "--at",
         action="append",
         metavar="AXIS=MM[+-MM]",
-        help="first declare that an axis is here",
+        help="first declare the position of an axis",
     )
     parser.add_argument("--json", action="store_true")
     parser.add_argument("--timeout", type=float, default=8.0, help="seconds to find the bridge")

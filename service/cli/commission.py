@@ -59,8 +59,8 @@ def commission(
     warnings.filterwarnings("ignore", module="pydicom")
     if series * slices < FEWEST_DELAYS:
         print(
-            f"autospine: {series} series of {slices} are {series * slices} slices: at least "
-            f"{FEWEST_DELAYS} are needed",
+            f"autospine: at least {FEWEST_DELAYS} slices are needed; {series} series of {slices} "
+            f"would give {series * slices}",
             file=sys.stderr,
         )
         raise SystemExit(BAD_INPUT)

@@ -39,13 +39,16 @@ def locate(
     path: Annotated[list[Path], typer.Argument(help="DICOM files or folders.")],
     shifts: Annotated[
         Path | None,
-        typer.Option(help="CSV file,row_px,col_px: localize one object from all files together."),
+        typer.Option(
+            help="CSV with the columns file,row_px,col_px: localize one object from all files "
+            "together."
+        ),
     ] = None,
     template: Annotated[
         Path | None,
         typer.Option(
-            help="CSV file,row_px,col_px: learn the object's image from the files listed (beside "
-            "the CSV), and fit it in every file of PATH."
+            help="CSV with the columns file,row_px,col_px: learn the object's image from the files "
+            "listed (beside the CSV), and fit it in every file of PATH."
         ),
     ] = None,
     method: Annotated[str, typer.Option(help=f"One of {', '.join(METHODS)}.")] = "ml",

@@ -43,7 +43,7 @@ def items_of(clock: ClockFinding, imaging: ImagingFinding) -> list[Item]:
         ),
         Item(
             "Acquisition times against the key presses at start and end",
-            "agree" if not clock.untruthful_s else f"contradict by {clock.untruthful_s:.2f} s",
+            "agree" if not clock.untruthful_s else f"disagree by {clock.untruthful_s:.2f} s",
             "agree within a person's reaction time",
             not clock.untruthful_s,
         ),

@@ -174,7 +174,7 @@ def _template(
     """
     along, _ = _expected(usual[0])
     if moved is None or along is None:
-        return float("nan"), "it takes the slices with the sign of the readout changed"
+        return float("nan"), "it needs the series with the readout direction reversed"
     learnt = usual[: len(usual) // 2]
     shift_px, sigma_px = moved
     shifts_px = [0 * along] * len(learnt) + [-2 * shift_px * along] * len(changed)

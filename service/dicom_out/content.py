@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from dicom_slice.geometry import SliceGeometry
 from service.procedure.estimate import axis_sigma, probability_within
 from service.procedure.plane import ImagePlane
 from service.procedure.registry import APPROACHES, GUIDE_APPROACH
-from service.procedure.targets import ENTRY_SET, TARGET_SET
+from service.procedure.targets import ENTRY_SET, TARGET_SET, TARGET_WITHDRAWN
 from service.room.history import targets_over_time
 from service.room.present import READY
 from sr_engine.request import geometry_of
@@ -149,7 +150,10 @@ def plan_events(record: CaseRecord) -> list[Event]:
     """By which the plan, target and entry point, changed; none before slices say whose it is."""
     if record.last_slice("assigned") is None:
         return []
-    return [event for kind in (TARGET_SET, ENTRY_SET) for event in record.events_of_kind(kind)]
+    changes = [e for kind in (TARGET_SET, ENTRY_SET) for e in record.events_of_kind(kind)]
+    first = min((e.event_id for e in changes if e.kind == TARGET_SET), default=math.inf)
+    withdrawn = [e for e in record.events_of_kind(TARGET_WITHDRAWN) if e.event_id > first]
+    return sorted([*changes, *withdrawn], key=lambda event: event.event_id)
 
 
 def _approach_during(record: CaseRecord, row: Measurement) -> Procedure | None:

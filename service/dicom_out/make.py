@@ -13,6 +13,7 @@ import os
 import re
 import sys
 import tempfile
+import warnings
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -99,10 +100,8 @@ def make_output(record: CaseRecord, output: Output) -> Path:
     name = str(path.relative_to(record.case_dir))
     if path.is_file() and record.is_sealed(name):
         return path
-    buffer = io.BytesIO()
     try:
-        dataset = _dataset(record, output)
-        dataset.save_as(buffer, enforce_file_format=True)
+        content = _encoded(_dataset(record, output))
     except OutputError:
         raise
     except KeyError as error:
@@ -111,9 +110,24 @@ def make_output(record: CaseRecord, output: Output) -> Path:
         # so highdicom and pydicom say that a source's header cannot be used
         raise OutputError(f"{output.name}: {error}") from error
     if not record.read_only:
-        record.seal_file(name, buffer.getvalue())
-    _write(path, buffer.getvalue())
+        record.seal_file(name, content)
+    _write(path, content)
     return path
+
+
+def _encoded(dataset: Dataset) -> bytes:
+    """In the slices' character set; where that lacks a letter, of the operator say, in UTF-8."""
+    for in_utf8 in (False, True):
+        if in_utf8:
+            dataset.decode()
+            dataset.SpecificCharacterSet = "ISO_IR 192"
+        buffer = io.BytesIO()
+        with warnings.catch_warnings(record=True) as said:
+            warnings.simplefilter("always")
+            dataset.save_as(buffer, enforce_file_format=True)
+        if not any("Failed to encode" in str(one.message) for one in said):
+            break
+    return buffer.getvalue()
 
 
 def _dataset(record: CaseRecord, output: Output) -> Dataset:

@@ -2,6 +2,8 @@
 us as a proposal goes back to them as it was decided.
 
 Labels and places are those that `dicom_slice.plan` reads: TARGET and ENTRY, points in patient mm.
+There is no such object without a point: where a target was withdrawn, its place is labelled
+WITHDRAWN, so that who was sent it before is told.
 """
 
 from __future__ import annotations
@@ -24,6 +26,8 @@ from service.dicom_out.identity import MAKER, SERIES_NUMBERS, software_version
 from service.dicom_out.source import frame_of_reference, tidy_patient
 from service.procedure.scan_frame import STUDY_ACCEPTED, places_good_since
 from service.procedure.targets import ENTRY_SET, TARGET_SET, TARGET_WITHDRAWN
+
+_WITHDRAWN = "WITHDRAWN"
 
 
 def plan_of(record: CaseRecord, event_id: int) -> Dataset:
@@ -66,6 +70,8 @@ def plan_of(record: CaseRecord, event_id: int) -> Dataset:
     made.InstanceCreationDate, made.InstanceCreationTime = made.ContentDate, made.ContentTime
     made.ContentLabel, made.ContentCreatorName = "AUTOSPINE", None
     made.ContentDescription = "Target and entry point (research)"
+    if event.kind == TARGET_WITHDRAWN:
+        made.ContentDescription = "The target was withdrawn (research)"
     points = [_point(*one) for one in _places(record, event)]
     group = Dataset()
     group.FrameOfReferenceUID, group.FiducialSequence = frame, points
@@ -100,6 +106,9 @@ def _places(record: CaseRecord, event: Event) -> list[tuple[str, Sequence[float]
         )
         if last is not None and last.seq > good_since and "patient_mm" in last.body:
             places.append((label, last.body["patient_mm"]))
+    if event.kind == TARGET_WITHDRAWN:
+        before = [e for e in record.events_of_kind(TARGET_SET) if e.event_id < event.event_id]
+        places.append((_WITHDRAWN, before[-1].body["patient_mm"]))
     return places
 
 

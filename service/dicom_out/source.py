@@ -11,6 +11,7 @@ from typing import Any
 
 import pydicom
 from pydicom.dataset import Dataset
+from pydicom.multival import MultiValue
 from pydicom.sequence import Sequence as DicomSequence
 from pydicom.valuerep import format_number_as_ds
 
@@ -50,12 +51,19 @@ def source_of(finding: ReportContent, index: int) -> Dataset:
 
 
 def tidy_patient(dataset: Dataset) -> None:
-    """Attributes that must be there are, if only empty; a sex that DICOM does not know is empty."""
+    """Attributes that must be there are, if only empty; a sex that DICOM does not know is empty.
+
+    The default alphabet before others has its name: highdicom does not know it by being left out.
+    """
     for name in _EMPTY_IF_MISSING:
         if name not in dataset:
             setattr(dataset, name, None)
     if dataset.PatientSex not in _SEXES:
         dataset.PatientSex = None
+    alphabets = dataset.get("SpecificCharacterSet")
+    if isinstance(alphabets, MultiValue) and not alphabets[0]:
+        dataset.decode()
+        dataset.SpecificCharacterSet = ["ISO 2022 IR 6", *alphabets[1:]]
 
 
 def frame_of_reference(dataset: Dataset) -> str:

@@ -56,7 +56,7 @@ function draw(state) {
   const desk = { folder: state.case_folder, role: page.role, busy: Boolean(state.procedure) };
   drawCaseDesk({ ...desk, begins: state.cases_begin_here, asks: Boolean(state.case_question) });
   drawHolding({ ...desk, holding: state.holding });
-  drawScannerClock({ clock: state.clock, clock_implies: state.clock_implies, role: page.role });
+  drawScannerClock({ clock: state.clock, clock_doubted: state.clock_doubted, clock_implies: state.clock_implies, role: page.role });
   drawParts({ robot: { linked: robot.linked, boot_id: robot.boot_id, phase: robot.phase, problem: robot.problem }, processes: state.processes, slices: state.slices });
   if (belief) drawBelief({ ...belief, settings: page.role === "operator" ? belief.settings : null });
   newAside([state.slices.quarantined, state.hold?.hold_id, page.role]);

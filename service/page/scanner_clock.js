@@ -55,7 +55,7 @@ function inWords(offset) {
   return (offset < 0 ? words.ahead : words.behind)(Math.abs(offset).toFixed(1));
 }
 
-export const drawScannerClock = whenChanged(({ clock, clock_implies, role }) => {
+export const drawScannerClock = whenChanged(({ clock, clock_doubted, clock_implies, role }) => {
   const known = clock
     ? [words.known(inWords(clock.offset_s), clock.uncertainty_s, words.compared(day(clock.compared_s), clock.who)), " (", ageOf(clock.compared_s), ` ${words.ago}). ${clock_implies}`]
     : [clock_implies];
@@ -76,6 +76,6 @@ export const drawScannerClock = whenChanged(({ clock, clock_implies, role }) => 
     type: "button", disabled: role !== "operator", title: words.forgetTitle,
     onclick: () => act(() => order("POST", "api/v1/clock/reset", { why: words.why })),
   }, words.forget);
-  replace(byId("scanner-clock"), h("p", { class: "quiet" }, ...known),
+  replace(byId("scanner-clock"), h("p", { class: clock_doubted ? "wrong" : "quiet" }, ...known),
     h("p", { class: "row" }, h("label", { htmlFor: "scanner-shows" }, words.reads), input, compare), said, use, clock ? h("p", {}, forget) : null);
 });

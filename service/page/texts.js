@@ -131,7 +131,7 @@ export const TEXTS = {
   events: { heading: "Event log", more: "Show more", fewer: "Show fewer", from: (id, source) => `event ${id}, from ${source}` },
   aside: {
     heading: "Slices set aside", columns: ["Slice", "Received", "Why", ""], none: "None.", use: (hold) => `Use at hold ${hold}`, why: "Why does it belong to this hold?",
-    giveUp: "No more slices will come for hold", giveUpButton: "Stop waiting for these slices", giveUpWhy: "said on the page",
+    giveUp: "No more slices will come for hold", giveUpButton: "Stop waiting for these slices", giveUpWhy: "entered on the page",
   },
   caseCard: {
     heading: "Case", label: "Case name", operator: "Operator", note: "Note", save: "Save", saved: "Saved.",
@@ -141,7 +141,7 @@ export const TEXTS = {
   caseDesk: {
     label: "Case name (no patient name)", operator: "Operator", note: "Note", start: "Start the case", goOn: "Continue this case",
     finish: "Finish the case …", finishNow: "Finish the case now", notYet: "Not yet", park: "Park the drives",
-    finishWhy: "This disarms the robot and closes the case. Report and export are written to its folder.",
+    finishWhy: "This disarms the robot and finishes the case. Report and export are written to its folder.",
     columns: ["What", "Received", "Why", ""], take: "Add to this case",
   },
   targets: {
@@ -161,7 +161,7 @@ export const TEXTS = {
     known: (words, s, who) => `The scanner clock ${words}, ± ${s} s; ${who}`, compared: (when, who) => `compared ${when} by ${who}`, ago: "ago",
     reads: "Scanner clock reads", now: "Scanner clock reads this now", then: (words) => `The scanner clock ${words}.`,
     bad: "Type what the scanner clock reads, for example 10:32:07.", use: "Use this", forget: "The scanner clock was changed: discard this",
-    forgetTitle: "Slices stay pending until the clocks are compared again.", why: "said on the page",
+    forgetTitle: "Slices stay pending until the clocks are compared again.", why: "entered on the page",
   },
   system: {
     heading: "System", service: "Service", robot: "Robot", slices: "Slices", none: "none", linked: (boot, phase) => `linked, session ${boot}, in phase ${phase}`,
@@ -184,7 +184,7 @@ export const TEXTS = {
     heading: "Proposed by a planning station", unnamed: "unnamed", from: (sender, via, at) => `from ${sender} by ${via}, ${at}`,
     target: (where) => `Target ${where} mm (LPS)`, entry: (where) => `Entry point ${where} mm (LPS)`, notYet: (what) => `Not known yet: ${what}.`,
     noFrame: "The message does not name its frame of reference: compare the position before you accept it.",
-    tissue: "Accept: target in tissue", oil: "Accept: as the fiducial appears", refuse: "Refuse", why: "Why not", whyHint: "reason (optional)",
+    tissue: "Accept: target in tissue", oil: "Accept: target for the fiducial", refuse: "Refuse", why: "Why not", whyHint: "reason (optional)",
   },
   login: { heading: "Log in to AutoSPINe Navigator", token: "Your token", button: "Log in", who: (name, role) => `${name} (${role})`, leave: "Log out" },
   refusal: { noAnswer: "The service does not answer.", status: (status) => `The service answered ${status}.` },

@@ -128,10 +128,10 @@ class ApproachArguments:
             return ""
         worst_mm = max(self.systematic_mm, default=0.0)
         return (
-            f"the middle of the fiducial is known to {worst_mm:.3f} mm (σ, one axis), and for this "
-            f"target that counts in full: an error below {self.tolerance_mm:g} mm cannot be "
-            f"said with {100 * self.confidence:g} %. Widen the tolerance, or record a target at "
-            "the fiducial's own place"
+            f"the fiducial's centre is known only to {worst_mm:.3f} mm (σ, one axis), and all of "
+            f"that affects this target: an error below {self.tolerance_mm:g} mm cannot be "
+            f"confirmed with {100 * self.confidence:g} % confidence. Widen the tolerance, or "
+            "record a target at the fiducial's own position"
         )
 
     def frames_wanted(self, estimate: FiducialEstimate, present: int) -> int:

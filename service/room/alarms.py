@@ -25,9 +25,10 @@ TO_DO = {
     "intake_failed": "Acquire the slice again; see the listener's log.",
     "late_or_clock_jump": "Compare the scanner clock again, then acquire the slices again.",
     "many_slices_wait": "Send only what is asked for; compare the clocks.",
+    "message_ignored": "Nothing is lost; see what the scanner sends besides slices.",
     "oversize": "Check what the scanner is sending: no slice is that large.",
     "plan_refused": "Correct the plan at the workstation and send it again.",
-    "push_delay_unlike_measured": "Compare the clocks; if it stays so, commission the site again.",
+    "push_delay_unlike_measured": "Compare the clocks; if it persists, commission the site again.",
     "same_uid_other_bytes": "Acquire the slice again; check which systems send to this listener.",
     "slice_refused": "Send or acquire the slice again.",
     "unfinished_files": "Nothing is lost: the scanner was never told that they had arrived. Send "

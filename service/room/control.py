@@ -236,7 +236,7 @@ class ControlLoop:
             return
         except Exception as error:
             if self._trouble.begin(error):
-                log.exception("the control loop holds")
+                log.exception("the control loop is suspended")
             self._hold()
 
     def _folder_to_serve(self) -> Path | None:

@@ -13,7 +13,7 @@ def may_start(record: CaseRecord, now: Now) -> ConflictError | None:
     if status is None:
         return ConflictError("no_link", "No link to the robot.")
     if record.running_procedure() is not None:
-        return ConflictError("busy", "A procedure is running: wait until it ends, or abort it.")
+        return ConflictError("busy", "A procedure is running: let it finish, or end it.")
     if needle_may_be_in(record) or status.insertion_locked:
         return ConflictError("insertion_locked", "Motion is locked until the needle is withdrawn.")
     if status.stopped or not status.armed:

@@ -230,7 +230,7 @@ def _case_ended(record: CaseRecord, measurement: Measurement) -> Lost | None:
     reopened = record.last_event(CASE_REOPENED)
     if reopened is None or reopened.seq < measurement.requested_seq:
         return None
-    return Lost("case_ended", "measured before the case was finished and reopened")
+    return Lost("case_ended", "measured before the case was finished and continued")
 
 
 def why_stood_no_more(facts: Mapping[str, Any], status: BridgeStatus | None) -> Lost | None:

@@ -8,8 +8,8 @@ table as it lies: when that may have moved, it is withdrawn.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict
@@ -21,7 +21,8 @@ from service.procedure.scan_frame import ScanFrame, calibration_good_since, othe
 PROPOSED, TAKEN, REFUSED = "plan_proposed", "proposal_taken", "proposal_refused"
 WITHDRAWN = "proposal_withdrawn"
 SCAN_FRAME = "scan_frame"
-MOST_OPEN = 8
+OPENIGTLINK = "OpenIGTLink"
+MOST_SENDERS, MOST_OF_ONE = 8, 4
 _MOST_SHOWN = 24
 _BORE_MM = 500.0
 
@@ -29,8 +30,8 @@ Point3 = tuple[float, float, float]
 
 
 class ProposalState(BaseModel):
-    """Patient LPS mm. state: open, taken, refused (with the reason), replaced by a newer one, or
-    withdrawn because the table may have moved.
+    """Patient LPS mm. state: open, taken, refused (with the reason), replaced by a newer one,
+    joined with its other half as a newer one, or withdrawn because the table may have moved.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -44,6 +45,7 @@ class ProposalState(BaseModel):
     entry_mm: Point3 | None = None
     direction: Point3 | None = None
     frame_of_reference_uid: str = ""
+    apart: bool = False
     note: str = ""
     state: str = "open"
     by: str = ""
@@ -56,6 +58,7 @@ class Plan:
 
     sender: where it came from; name: what the sender calls it. direction: unit vector of the
     needle, where the plan has one. frame_of_reference_uid: empty where the way it came cannot tell.
+    apart: its target and its entry point came in two messages.
     """
 
     sender: str
@@ -65,17 +68,60 @@ class Plan:
     entry_mm: Point3 | None = None
     direction: Point3 | None = None
     frame_of_reference_uid: str = ""
+    apart: bool = False
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """code: `proposed` (with its number in the case), `invalid`, `out_of_reach` or `too_many`."""
+    """code: `proposed` (with its number in the case), `invalid`, `out_of_reach` or `too_many`; or
+    why the room can take none now, `no_case` say.
+    """
 
     code: str
     text: str
     number: int | None = None
     reach_known: bool = False
     case_uid: str = ""
+
+
+def host_of(one: Plan | ProposalState) -> str:
+    """The machine that it came from: who connects again has another port."""
+    if one.via == OPENIGTLINK:
+        return one.sender.rpartition(":")[0] or one.sender
+    return one.sender.rpartition(" ")[2]
+
+
+def why_too_many(plan: Plan, known: Sequence[ProposalState]) -> str:
+    """Why the operator is not to be shown one more; empty where that may be. One machine cannot
+    take the place of the others.
+    """
+    hosts = [host_of(one) for one in known if one.state == "open" and one.sender != plan.sender]
+    own = hosts.count(host_of(plan))
+    if own >= MOST_OF_ONE:
+        return f"{own} proposals of {host_of(plan)} are already waiting for the operator"
+    others = set(hosts) - {host_of(plan)}
+    if len(others) >= MOST_SENDERS:
+        return f"proposals of {len(others)} stations are already waiting for the operator"
+    return ""
+
+
+def with_other_half(plan: Plan, known: Sequence[ProposalState]) -> Plan:
+    """Target and entry point that one sender sends apart are one plan while they are open: with the
+    half that it sent before, if it did so apart. A given entry point says the direction.
+    """
+    for one in known:
+        is_half = one.apart or one.target_mm is None or one.entry_mm is None
+        if one.state != "open" or one.sender != plan.sender or not is_half:
+            continue
+        if why_other_frame(one.frame_of_reference_uid, plan.frame_of_reference_uid):
+            continue
+        frame = plan.frame_of_reference_uid or one.frame_of_reference_uid
+        both = replace(plan, frame_of_reference_uid=frame, direction=None, apart=True)
+        if plan.entry_mm is None and one.entry_mm is not None:
+            return replace(both, entry_mm=one.entry_mm)
+        if plan.target_mm is None and one.target_mm is not None:
+            return replace(both, target_mm=one.target_mm, name=one.name)
+    return plan
 
 
 def why_senseless(plan: Plan) -> str:
@@ -117,7 +163,9 @@ def why_void(record: CaseRecord, proposed: Event) -> str:
     Whether the sender says its frame of reference or not: it saw the slices of its time.
     """
     if proposed.seq <= calibration_good_since(record):
-        return "the table may have moved since, or the case was opened again; plan it again"
+        return (
+            "the table may have moved since, or the case was finished and continued; plan it again"
+        )
     frame = ScanFrame(**proposed.body.get(SCAN_FRAME, {}))
     other = other_place_since(record, proposed.seq, frame)
     if not other:
@@ -154,8 +202,7 @@ class ProposalBook:
         if event.kind == PROPOSED:
             for number, one in self._known.items():
                 if (one.sender, one.state) == (body["sender"], "open"):
-                    reason = f"replaced by proposal {event.event_id}"
-                    self._close(number, {"state": "replaced", "reason": reason})
+                    self._close(number, _followed_by(event))
             self._known[event.event_id] = ProposalState(
                 number=event.event_id, at_s=event.wall_s, **body
             )
@@ -166,6 +213,12 @@ class ProposalBook:
 
     def _close(self, number: int, change: Mapping[str, Any]) -> None:
         self._known[number] = self._known[number].model_copy(update=dict(change))
+
+
+def _followed_by(event: Event) -> dict[str, str]:
+    if event.body.get("apart"):
+        return {"state": "joined", "reason": f"joined with its other half as {event.event_id}"}
+    return {"state": "replaced", "reason": f"replaced by proposal {event.event_id}"}
 
 
 def _events(record: CaseRecord, after_id: int) -> list[Event]:

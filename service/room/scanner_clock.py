@@ -15,7 +15,7 @@ from typing import Any
 from case_record.record import CaseRecord
 from case_record.rows import Event, Hold
 from dicom_listener.clock import ClockRules
-from dicom_listener.scanner_clocks import CLOCK_COMPARED, CLOCK_FORGOTTEN
+from dicom_listener.scanner_clocks import CLOCK_COMPARED, CLOCK_DOUBTED, CLOCK_FORGOTTEN
 from room_config.load import Config
 from service.room.alarms import Condition
 from service.room.present import computer_start
@@ -28,12 +28,35 @@ _WAITS = "slices are pending: compare the clocks, or confirm the hold at which e
 
 def clock_update(config: Config, record: CaseRecord, now_s: float) -> dict[str, Any]:
     """The fields of the room's state that tell of the scanner's clock."""
-    compared = _last_comparison(config, record)
-    return {"clock": compared, "clock_implies": implied(config, compared, now_s)}
+    compared, doubted = _last_comparison(config, record), doubt(config, record)
+    return {
+        "clock": compared,
+        "clock_doubted": doubted,
+        "clock_implies": implied(config, compared, now_s, doubted),
+    }
 
 
-def implied(config: Config, compared: ClockState | None, now_s: float) -> str:
+def doubt(config: Config, record: CaseRecord) -> str:
+    """What a slice has shown against what is known of the clock; empty where nothing stands.
+
+    As `ScannerClocks` has it: until the clocks are compared again, or somebody says they were set.
+    """
+    doubted = record.last_event(CLOCK_DOUBTED)
+    if doubted is None:
+        return ""
+    told = (record.last_event(kind) for kind in (CLOCK_COMPARED, CLOCK_FORGOTTEN))
+    filed = _from_file(config)
+    if any(event is not None and event.event_id > doubted.event_id for event in told):
+        return ""
+    if filed is not None and _made_s(filed) > doubted.body["at_s"]:
+        return ""
+    return f"{doubted.body['scanner']}: {doubted.body['text']}"
+
+
+def implied(config: Config, compared: ClockState | None, now_s: float, doubted: str = "") -> str:
     """In words, what becomes of slices with what is known now."""
+    if doubted:
+        return f"Doubted: compare again ({doubted}). Until then slices are pending."
     most_s = config.listener.prompt_delay_s
     if compared is None:
         if most_s is None:
@@ -164,7 +187,11 @@ def note_step(record: CaseRecord, step_s: float) -> None:
 
 
 def clock_was_set(config: Config, record: CaseRecord) -> list[Condition]:
-    """That the computer's clock was set, until it is compared again."""
+    """That the computer's clock was set, or what is known is doubted, until compared again."""
+    doubted = doubt(config, record)
+    if doubted and not config.listener.arrival_mode:
+        text = f"The scanner's clock is doubted: {doubted}; slices stay pending"
+        return [Condition("clock_doubted", "alarm", text, "Compare the clocks again.")]
     step = _last_step(record)
     if step is None:
         return []

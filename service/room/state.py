@@ -275,6 +275,7 @@ class RoomState(_Frozen):
     reconstruction: ReconstructionState | None = None
     other_fiducial: FiducialState | None = None
     clock: ClockState | None = None
+    clock_doubted: str = ""
     clock_implies: str = ""
     hold: HoldState | None = None
     entry_patient_mm: tuple[float, float, float] | None = None

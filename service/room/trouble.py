@@ -70,14 +70,15 @@ class Trouble:
 
     def refusal(self) -> ConflictError:
         text = (
-            f"The case record cannot be used ({self.why}): no command is carried out until it can."
+            f"The case record cannot be used ({self.why}): no command is carried out until it "
+            "can be."
         )
         return ConflictError("record_unusable", text)
 
     def condition(self) -> Condition:
         text = f"The case record cannot be used: {self.why}"
         what = (
-            "Free space on the case's disk, or remount it. Motion is blocked; the room then "
+            "Free space on the case's disk, or remount it. Motion is blocked until then; the room "
             "continues by itself."
         )
         return Condition("record_unusable", "alarm", text, what)

@@ -13,7 +13,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from service.room.proposals import Plan, Verdict
+from dicom_slice.plan import ENTRY, TARGET, label_of
+from service.room.proposals import OPENIGTLINK, Plan, Verdict
 from service.room.state import RoomState
 from service.slicer.messages import (
     COMMAND_HEAD,
@@ -42,8 +43,10 @@ from service.slicer.reading import (
 from service.slicer.scene import axes_along, code_of, status_of
 
 Array = NDArray[np.float64]
-OPENIGTLINK = "OpenIGTLink"
 INVALID, OUT_OF_REACH = 1, 3
+_REGISTRATION = "CALIBRATION"
+_TRANSFORMS = {"TGT_": "TARGET", "CLB_": _REGISTRATION, "NPOS_": "CURRENT_POSITION"}
+_ANSWERED = ("STRING", "GET_STATUS", "GET_TRANSFORM", "GET_TRANS", "POINT", "COMMAND")
 _PHASES = ("START_UP", "PLANNING", "CALIBRATION", "TARGETING")
 _STATUS_QUERIES, _POSE_QUERIES = (
     ("CURRENT_STATUS", "GET_STATUS"),
@@ -56,7 +59,9 @@ _OFF = "only STOP is accepted from peers here: openigtlink.inwards is off"
 
 @dataclass(frozen=True)
 class Answer:
-    """replies: sent at once. plan: to be put before the operator; registration: to be kept."""
+    """replies: sent at once. plan: to be put before the operator; registration: to be kept; the
+    room's verdict on either is told later.
+    """
 
     replies: tuple[Message, ...] = ()
     plan: Plan | None = None
@@ -68,6 +73,19 @@ def acknowledge(message: Received, state: RoomState) -> Message:
     if message.kind == "COMMAND":
         return _command_answer(message, "", state.at_s)
     return Message(message.kind, _ack_name(message.device), state.at_s, message.content)
+
+
+def concerns_us(message: Received) -> bool:
+    """Whether it is for the robot at all: stations stream transforms of their own as well."""
+    if message.kind == "TRANSFORM":
+        return message.device.startswith(tuple(_TRANSFORMS))
+    return message.kind in _ANSWERED
+
+
+def not_looked_at(message: Received, at_s: float) -> Message:
+    """What a flood is told."""
+    text = "too many messages at once: some were not looked at"
+    return status(_about(message), at_s, STATUS_NOT_READY, "too_many", text)
 
 
 def answer(
@@ -83,7 +101,7 @@ def answer(
         "POINT": lambda: _points(message, state, sender),
         "COMMAND": lambda: Answer((_command_answer(message, _NO_SUCH, state.at_s),)),
     }
-    if message.kind not in known or (message.kind == "TRANSFORM" and not _for_us(message)):
+    if not concerns_us(message):
         return Answer()
     if not inwards:
         return Answer((status(_about(message), state.at_s, STATUS_ACCESS_DENIED, "off", _OFF),))
@@ -100,13 +118,20 @@ def verdict_of(plan: Plan, verdict: Verdict, state: RoomState) -> tuple[Message,
         return (_error("TARGET", state, INVALID, verdict.text),)
     if verdict.code == "out_of_reach":
         return (_error("TARGET", state, OUT_OF_REACH, verdict.text),)
-    if verdict.code == "too_many":
+    if verdict.code != "proposed":  # the room cannot now, and says why
         return (status("TARGET", state.at_s, STATUS_NOT_READY, verdict.code, verdict.text),)
     said = status("TARGET", state.at_s, STATUS_OK, verdict.code, verdict.text)
     if not verdict.reach_known or plan.target_mm is None:
         return (said,)
     axes = _axes_of(plan)
     return said, transform("REACHABLE_TARGET", state.at_s, axes, np.array(plan.target_mm))
+
+
+def registered(verdict: Verdict, at_s: float) -> Message:
+    """What the sender of a registration is told once the room has kept it, or has not."""
+    if verdict.code == "recorded":
+        return status(_REGISTRATION, at_s, STATUS_OK, _REGISTRATION, "recorded and shown only")
+    return status(_REGISTRATION, at_s, STATUS_NOT_READY, verdict.code, verdict.text)
 
 
 def decision_of(number: int, state_word: str, by: str, reason: str, at_s: float) -> Message:
@@ -190,9 +215,8 @@ def _transform(message: Received, state: RoomState, sender: str) -> Answer:
         )
         return Answer((ack,), plan=plan)
     if message.device.startswith("CLB_"):
-        said = status(about, state.at_s, STATUS_OK, about, "recorded and shown only")
         matrix = np.hstack([axes, origin[:, None]]).tolist()
-        return Answer((ack, said), registration=matrix)
+        return Answer((ack,), registration=matrix)
     return Answer((ack, status_of(state, about)))
 
 
@@ -200,7 +224,7 @@ def _points(message: Received, state: RoomState, sender: str) -> Answer:
     found = points_of(message)
     if len(found) > _MOST_POINTS:
         raise MessageError(f"{len(found)} points are not a plan: send TARGET and ENTRY")
-    target, entry = _labelled(found, "TARGET"), _labelled(found, "ENTRY")
+    target, entry = _labelled(found, TARGET), _labelled(found, ENTRY)
     if target is None and entry is None:
         raise MessageError("no point is labelled TARGET or ENTRY")
     plan = Plan(
@@ -221,7 +245,7 @@ def _points(message: Received, state: RoomState, sender: str) -> Answer:
 
 def _labelled(found: list[ReceivedPoint], label: str) -> tuple[float, float, float] | None:
     """The point of this label: of several the one that is selected."""
-    named = [point for point in found if point.name.strip().upper() == label]
+    named = [point for point in found if label_of(point.name) == label]
     selected = [point for point in named if point.group.strip().upper() == "SELECTED"]
     chosen = selected or named
     if len(chosen) > 1:
@@ -244,15 +268,11 @@ def _command_answer(message: Received, error: str, at_s: float) -> Message:
     return Message("RTS_COMMAND", message.device, at_s, content)
 
 
-def _for_us(message: Received) -> bool:
-    return message.device.startswith(("TGT_", "CLB_", "NPOS_"))
-
-
 def _about(message: Received) -> str:
     """The device name of the STATUS that answers a message."""
     if message.kind == "TRANSFORM":
-        names = {"TGT_": "TARGET", "CLB_": "CALIBRATION", "NPOS_": "CURRENT_POSITION"}
-        return next(name for start, name in names.items() if message.device.startswith(start))
+        starts = (one for one in _TRANSFORMS if message.device.startswith(one))
+        return _TRANSFORMS[next(starts)]
     return {"POINT": "TARGET", "STRING": message.device}.get(message.kind, message.kind)
 
 

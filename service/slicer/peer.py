@@ -14,9 +14,20 @@ from typing import Any, Protocol
 
 import structlog
 
-from service.room.proposals import Plan, Verdict
+from service.room.proposals import OPENIGTLINK, Plan, Verdict
+from service.room.readiness import ConflictError
 from service.room.state import RoomState
-from service.slicer.answers import Answer, acknowledge, answer, decision_of, verdict_of
+from service.slicer.allowance import Allowances
+from service.slicer.answers import (
+    Answer,
+    acknowledge,
+    answer,
+    concerns_us,
+    decision_of,
+    not_looked_at,
+    registered,
+    verdict_of,
+)
 from service.slicer.messages import STATUS_NOT_READY, Message, status
 from service.slicer.pose import Pose
 from service.slicer.reading import Received, Stream, stop_word
@@ -28,7 +39,7 @@ _HALF_A_MESSAGE_S = 2.0
 _MOST_WAITING = 64
 _MOST_REPLIES = 256
 _BETWEEN_ANSWERS_S = 0.01
-_PROPOSALS_AT_ONCE, _PROPOSALS_PER_S = 10.0, 1.0
+_FLOOD_TOLD_S = 1.0
 _STOP_AGAIN_S = 0.1
 _STOPPED_WITHIN_S = 0.7
 _NOT_STOPPED = {
@@ -44,6 +55,7 @@ class Room(Protocol):
     """What peers may see and ask of the room."""
 
     inwards: bool
+    allowances: Allowances
 
     @property
     def state(self) -> RoomState: ...
@@ -69,6 +81,7 @@ class Peer:
         self, name: str, room: Room, reader: asyncio.StreamReader, writer: asyncio.StreamWriter
     ) -> None:
         """name: who it is for the record, address and port."""
+        self._host = name.rpartition(":")[0]
         self.name = name
         self._room = room
         self._reader, self._writer = reader, writer
@@ -79,8 +92,7 @@ class Peer:
         self._wake = asyncio.Event()
         self._sent: Scene = {}
         self._mine: dict[tuple[str, int], bool] = {}  # whether the room has shown its case
-        self._stopped_at_s = -1e9
-        self._allowance, self._allowance_at_s = _PROPOSALS_AT_ONCE, time.monotonic()
+        self._stopped_at_s = self._flood_told_s = -1e9
         self._telling: set[asyncio.Task[None]] = set()
         self._dropped: Counter[str] = Counter()
         self._logged = 0
@@ -111,7 +123,8 @@ class Peer:
             mine = (state.case_uid, one.number)
             if mine in self._mine and one.state != "open":
                 del self._mine[mine]
-                self._decided(one.number, one.state, one.by, one.reason)
+                if one.state != "joined":  # the answer to the other half has said so
+                    self._decided(one.number, one.state, one.by, one.reason)
         for (case_uid, number), was_shown in list(self._mine.items()):
             if case_uid == state.case_uid:
                 self._mine[case_uid, number] = True
@@ -160,10 +173,17 @@ class Peer:
             self._sent = {}  # what could not be said in the other version is said now
 
     def _put(self, message: Received) -> None:
+        """What is not for the robot, a tracker's stream say, keeps nothing waiting."""
+        if not concerns_us(message):
+            return
         try:
             self._waiting.put_nowait(message)
         except asyncio.QueueFull:
             self._dropped["flood"] += 1
+            now_s = time.monotonic()
+            if now_s - self._flood_told_s > _FLOOD_TOLD_S:
+                self._flood_told_s = now_s
+                self._reply(not_looked_at(message, self._room.state.at_s))
 
     def _log_faults(self) -> None:
         """When the first comes, and whenever their number has doubled."""
@@ -209,7 +229,8 @@ class Peer:
                 await self._propose(said.plan)
             if said.registration is not None:
                 arguments = {"name": message.device, "matrix": said.registration}
-                await self._ask("note_registration", arguments)
+                verdict = await self._ask("note_registration", arguments)
+                self._reply(registered(verdict, self._room.state.at_s))
             await asyncio.sleep(_BETWEEN_ANSWERS_S)
 
     def _answer(self, message: Received) -> Answer:
@@ -217,36 +238,24 @@ class Peer:
         return answer(message, room.state, room.pose, self.name, room.inwards)
 
     async def _propose(self, plan: Plan) -> None:
-        if not self._may_propose():
-            self._dropped["proposals"] += 1
-            verdict = Verdict(
-                "too_many", "too many proposals: at most one per second is considered"
-            )
-        else:
-            verdict = await self._ask("propose", {"plan": plan})
+        verdict = await self._ask("propose", {"plan": plan})
         if verdict.number is not None:
             self._mine[verdict.case_uid, verdict.number] = False
         self._reply(*verdict_of(plan, verdict, self._room.state))
         self.look(self._room.state)  # it may have been decided by now
 
-    def _may_propose(self) -> bool:
-        now_s = time.monotonic()
-        more = (now_s - self._allowance_at_s) * _PROPOSALS_PER_S
-        self._allowance = min(_PROPOSALS_AT_ONCE, self._allowance + more)
-        self._allowance_at_s = now_s
-        if self._allowance < 1:
-            return False
-        self._allowance -= 1
-        return True
-
     async def _ask(self, name: str, arguments: dict[str, Any]) -> Verdict:
         """Put it to the room; a room that cannot now says so."""
-        arguments = {**arguments, "by": f"OpenIGTLink {self.name}"}
+        if not self._room.allowances.of(self._host, name).take():
+            self._dropped["too many"] += 1
+            return Verdict("too_many", f"too many from {self._host}: at most one per second")
+        arguments = {**arguments, "by": f"{OPENIGTLINK} {self.name}"}
         try:
             said = await asyncio.to_thread(self._room.call, name, arguments)
         except Exception as error:  # a peer must not end the service, whatever the room is at
             log.warning("not recorded", peer=self.name, what=name, reason=str(error))
-            return Verdict("too_many", f"not recorded: {error}")
+            code = error.code if isinstance(error, ConflictError) else "not_recorded"
+            return Verdict(code, f"not recorded: {error}")
         return said if isinstance(said, Verdict) else Verdict("recorded", "")
 
     def _reply(self, *messages: Message) -> None:

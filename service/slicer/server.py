@@ -25,6 +25,7 @@ from room_config.networks import address_of
 from room_config.openigtlink import OpenIgtLinkConfig
 from service.room.control import STALE_S, ControlLoop
 from service.room.state import RoomState
+from service.slicer.allowance import Allowances
 from service.slicer.peer import Peer
 from service.slicer.pose import CURRENT_POSITION, Pose, pose_message, pose_of
 from service.slicer.scene import Images, Scene, scene_of, stale
@@ -65,6 +66,7 @@ class OpenIgtLinkServer:
         self._loop = loop
         self._own = config.openigtlink
         self.inwards = self._own.inwards
+        self.allowances = Allowances()
         self._networks = [ipaddress.ip_network(text) for text in self._own.peer_networks]
         self._images = Images()
         self._peers: set[Peer] = set()

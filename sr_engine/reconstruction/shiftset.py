@@ -138,7 +138,7 @@ def require_regular(
         return condition
     if len(shifts) < factor**2:
         raise SingularShiftSetError(
-            f"{len(shifts)} shifts cannot determine factor {factor}: {factor**2} or more are needed"
+            f"factor {factor} needs at least {factor**2} shifts, got {len(shifts)}"
         )
     raise SingularShiftSetError(
         f"the {len(shifts)} shifts are singular for factor {factor} (condition number "

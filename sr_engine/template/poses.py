@@ -108,6 +108,6 @@ def _fit_near(template: Template, frame: Array, near_px: Array, gate_px: float) 
     if not np.all(high > low):
         raise ObjectAtBorderError(
             f"row {near_px[0]:.0f}, col {near_px[1]:.0f}, where the object is looked for, lies "
-            "outside of the frame"
+            "outside the frame"
         )
     return template.fit(frame, region=(int(low[0]), int(low[1]), int(high[0]), int(high[1])))

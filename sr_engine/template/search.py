@@ -48,8 +48,8 @@ def find_object(
     best, second = (float(peaks.flat[i]) for i in order)
     if not best > LEAST_LIKENESS:
         raise NoRoundObjectError(
-            f"nothing in the frame resembles the template (likeness {best:.2f}, least "
-            f"{LEAST_LIKENESS:g})"
+            f"nothing in the frame resembles the template (likeness {best:.2f}, at "
+            f"least {LEAST_LIKENESS:g} needed)"
         )
     if second > _AMBIGUOUS * best:
         (row, col), (row2, col2) = places

@@ -226,7 +226,7 @@ def test_the_holes_of_a_sheet_are_found_in_its_photo_and_one_too_many_is_said(tm
     found = holes_of(path, 12.0, 14)
     order = [int(np.argmin(np.linalg.norm(found - one, axis=1))) for one in places_mm]
     assert found[order] == pytest.approx(places_mm, abs=0.02)
-    with pytest.raises(ValueError, match="14 holes found where 13 punctures were made"):
+    with pytest.raises(ValueError, match="holes found: 14, punctures made: 13"):
         holes_of(path, 12.0, 13)
     with pytest.raises(ValueError, match="no photo of the sheet of sr"):
         read_places(tmp_path, ["sr"], 14, 12.0)

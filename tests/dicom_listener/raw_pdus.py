@@ -34,6 +34,10 @@ def associate(
     return struct.pack(">BBL", 1, 0, len(body)) + body
 
 
+def pdu(kind: int, body: bytes = bytes(4)) -> bytes:
+    return struct.pack(">BBL", kind, 0, len(body)) + body
+
+
 RELEASE = struct.pack(">BBL", 5, 0, 4) + bytes(4)
 ABORT = struct.pack(">BBL", 7, 0, 4) + bytes(4)
 
@@ -47,6 +51,17 @@ def store_command(uid: str, *, priority: int = 0) -> bytes:
     fields = element(0x0002, MR_IMAGE.encode()) + element(0x0100, struct.pack("<H", 1))
     fields += element(0x0110, struct.pack("<H", 1)) + element(0x0700, struct.pack("<H", priority))
     fields += element(0x0800, struct.pack("<H", 0)) + element(0x1000, uid.encode())
+    return element(0, struct.pack("<L", len(fields))) + fields
+
+
+def command(field: int, *, sop_class: str = MR_IMAGE, has_data: bool = False) -> bytes:
+    """A command of any kind; its class as the affected one."""
+    fields = element(0x0002, sop_class.encode()) + element(0x0100, struct.pack("<H", field))
+    fields += element(0x0120 if field & 0x8000 or field == 0x0FFF else 0x0110, b"\1\0")
+    fields += element(0x0700, b"\0\0") + element(0x0800, b"\0\0" if has_data else b"\1\1")
+    if field & 0x8000:
+        fields += element(0x0900, b"\0\0")
+    fields += element(0x1000, b"1.2.3")
     return element(0, struct.pack("<L", len(fields))) + fields
 
 

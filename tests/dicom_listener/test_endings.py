@@ -14,10 +14,12 @@ from raw_pdus import (
     RELEASE,
     answer,
     associate,
+    command,
     context,
     encoded,
     item,
     p_data,
+    pdu,
     status_of,
     store_command,
 )
@@ -25,8 +27,9 @@ from test_scp import Serving, serving
 
 from dicom_listener.negotiation import is_storage
 from dicom_listener.network.association_request import MalformedRequestError, mended_request
+from dicom_listener.network.conversation import BreachError, Phase, check_turn
 
-ACCEPTED, ABORTED, DATA = 2, 7, 4
+ACCEPTED, REJECTED, DATA, RELEASED, ABORTED = 2, 3, 4, 6, 7
 pytestmark = pytest.mark.filterwarnings("ignore:.*UI.*:UserWarning")
 
 
@@ -185,6 +188,164 @@ def test_a_message_that_cannot_be_read_ends_the_association_with_a_line(tmp_path
         assert answer(sock)[0] == ABORTED
         wait_for(lambda: endings(server))
         assert "an unreadable message: a C-STORE without a SOP Instance UID" in endings(server)[0]
+
+
+DATA_SET = encoded(mr_data_set("1.2.3"))
+FIND = "1.2.840.10008.5.1.4.1.2.2.1"
+TWO_PARTS = struct.pack(">LBB", len(command(0x30)) + 2, 1, 3) + command(0x30)
+
+
+@pytest.mark.parametrize(
+    ("said", "kind", "why"),
+    [
+        (p_data(3, store_command("1.2.3")) + RELEASE, "unfinished", "released, in the middle of a"),
+        (
+            p_data(3, store_command("1.2.3")) + p_data(0, DATA_SET[:500]) + RELEASE,
+            "unfinished",
+            "released, in the middle of a message (6",
+        ),
+        (p_data(1, store_command("1.2.3")[:30]) + RELEASE, "unfinished", "released, in the middle"),
+        (p_data(3, command(0x7777)), "not_offered", "an unknown command (0x7777), which is not of"),
+        (p_data(3, command(0x0150)), "not_offered", "an N-DELETE, which is not offered here"),
+        (p_data(3, command(0x0020, has_data=True)), "not_offered", "a C-FIND, which is not offere"),
+        (p_data(3, command(0x0130)), "not_offered", "an N-ACTION, which is not offered here"),
+        (p_data(3, command(0x0100)), "not_offered", "an N-EVENT-REPORT, which is not offered here"),
+        (p_data(3, command(0x8001)), "not_offered", "a C-STORE response to nothing that was ask"),
+        (p_data(3, command(0x8100)), "not_offered", "an N-EVENT-REPORT response to nothing that"),
+        (
+            p_data(3, store_command("1.2.3"), 5) + p_data(2, DATA_SET, 5),
+            "not_offered",
+            "a C-STORE on presentation context 5, which was not accepted",
+        ),
+        (
+            p_data(3, command(1, sop_class=FIND, has_data=True)) + p_data(2, DATA_SET),
+            "not_offered",
+            "a C-STORE of Study Root Query/Retrieve Information Model - FIND, which is no kind of",
+        ),
+        (
+            p_data(3, command(1, sop_class="1.2.3.4", has_data=True)) + p_data(2, DATA_SET),
+            "not_offered",
+            "a C-STORE of 1.2.3.4, which was not proposed",
+        ),
+        (p_data(2, DATA_SET), "out_of_turn", "a data set without a command"),
+        (p_data(0, DATA_SET[:100]), "out_of_turn", "a data set without a command"),
+        (
+            p_data(1, store_command("1.2.3")[:30]) + p_data(2, DATA_SET),
+            "out_of_turn",
+            "a data set in the middle of its command, in the middle of a message (42 bytes",
+        ),
+        (
+            p_data(3, store_command("1.2.3")) + p_data(3, store_command("1.2.4")),
+            "out_of_turn",
+            "a command before the data set of a C-STORE was whole, in the middle of a message (",
+        ),
+        (
+            p_data(3, store_command("1.2.3")) + p_data(2, DATA_SET, 3),
+            "out_of_turn",
+            "one message on two presentation contexts, in the middle of a message (",
+        ),
+        (pdu(4, TWO_PARTS + TWO_PARTS), "out_of_turn", "two messages in one PDU"),
+        (associate(), "out_of_turn", "a second association request"),
+        (
+            p_data(3, store_command("1.2.3")) + associate(),
+            "out_of_turn",
+            "a second association request, in the middle of a message (112 bytes",
+        ),
+        (pdu(2), "out_of_turn", "an acceptance of an association, for which nobody had asked"),
+        (pdu(6), "out_of_turn", "an answer to a release, for which nobody had asked"),
+        (pdu(9), "unreadable", "an unknown kind of PDU (0x09)"),
+        (pdu(4, b""), "unreadable", "a PDU for a message with nothing in it"),
+        (
+            pdu(4, b"\0\0\0\x64\1\3ab"),
+            "unreadable",
+            "a part of a message that does not fit its PDU",
+        ),
+        (p_data(3, b"\xff" * 40), "unreadable", "a command that cannot be read"),
+        (p_data(3, command(1)[:20]), "unreadable", "a command that cannot be read"),
+        (p_data(3, b""), "unreadable", "a command that does not say what it is"),
+        (
+            p_data(3, command(1, has_data=True).replace(b"\x10\1\2", b"\x20\1\2"))
+            + p_data(2, DATA_SET),
+            "unreadable",
+            "an unreadable message: its message ID, SOP class or status is missing",
+        ),
+    ],
+)
+def test_what_is_said_out_of_turn_or_not_offered_ends_with_its_reason(tmp_path, said, kind, why):
+    with serving(tmp_path) as server:
+        with connected(server, associate()) as sock:
+            assert answer(sock)[0] == ACCEPTED
+            sock.sendall(said)
+            assert answer(sock)[0] == (RELEASED if kind == "unfinished" else ABORTED)
+        wait_for(lambda: endings(server))
+        (line,) = endings(server)
+        assert line.startswith(f"association of 'SCANNER' (127.0.0.1): {why}")
+        assert server.count("association_endings_total", ending=kind) == 1
+        assert server.count("alarms_total", kind="association_ended") == 1
+        assert server.stored == []
+        wait_for(lambda: server.scp.open_associations == 0)
+
+
+@pytest.mark.parametrize(
+    ("said", "why"),
+    [
+        (p_data(3, store_command("1.2.3")), "a message before any association request"),
+        (RELEASE, "a release before any association request"),
+        (ABORT, "an abort before any association request"),
+        (pdu(2), "an acceptance of an association before any association request"),
+        (associate()[:50], "no whole association request within 0.3 s"),
+    ],
+)
+def test_who_speaks_before_an_association_is_named(tmp_path, said, why):
+    with serving(tmp_path, acse_timeout_s=0.3) as server:
+        with connected(server, said) as sock:
+            assert sock.recv(1) == b""
+        wait_for(lambda: endings(server))
+        assert endings(server) == [f"connection of 127.0.0.1: {why}"]
+        assert server.count("association_endings_total", ending="no_request") == 1
+        assert server.count("connections_dropped_total") == 1
+
+
+@pytest.mark.parametrize("said", [b"", b"GET / HTTP/1.0\r\n\r\n"])
+def test_a_health_check_is_counted_and_gives_no_line(tmp_path, said):
+    with serving(tmp_path) as server:
+        with connected(server, said):
+            pass
+        wait_for(lambda: server.count("connections_dropped_total") == 1)
+        assert endings(server) == []
+
+
+@pytest.mark.parametrize(("version", "is_taken"), [(b"\0\3", True), (b"\0\2", False)])
+def test_of_the_protocol_versions_that_are_offered_ours_must_be_one(tmp_path, version, is_taken):
+    with serving(tmp_path) as server:
+        with connected(server, associate()[:6] + version + associate()[8:]) as sock:
+            assert answer(sock)[0] == (ACCEPTED if is_taken else REJECTED)
+            if is_taken:
+                return
+        wait_for(lambda: endings(server))
+        text = "connection of 127.0.0.1: an association by another protocol version"
+        assert endings(server) == [text]
+        assert server.count("association_endings_total", ending="not_offered") == 1
+
+
+def test_a_message_before_the_association_is_accepted_ends_it_with_a_line():
+    with pytest.raises(BreachError, match="a message before the association was accepted"):
+        check_turn(DATA, Phase.ASKED)
+    with pytest.raises(BreachError, match="a message after the request for a release"):
+        check_turn(DATA, Phase.RELEASING)
+
+
+def test_a_cancel_is_named_and_the_slice_behind_it_comes_through(tmp_path):
+    with serving(tmp_path) as server, connected(server, associate()) as sock:
+        answer(sock)
+        sock.sendall(p_data(3, command(0x0FFF)))
+        assert store(sock, "1.2.3", DATA_SET) == 0
+        sock.sendall(RELEASE)
+        assert answer(sock)[0] == RELEASED
+        text = "association of 'SCANNER' (127.0.0.1): a C-CANCEL; there is nothing to cancel"
+        assert list(server.scp.alarms) == [("message_ignored", text)]
+        assert server.count("alarms_total", kind="message_ignored") == 1
+        wait_for(lambda: server.count("association_endings_total", ending="released") == 1)
 
 
 def test_no_more_contexts_than_there_are_make_a_request():

@@ -242,7 +242,7 @@ def test_a_comparison_from_long_ago_holds_no_more_unless_the_scanner_is_synchron
     with CaseRecord(tmp_path / "case", create=True) as record, listening(config) as listener:
         begin_hold(record, time.time() - 20.0, expected=9)
         send(listener.port, mr_data_set("1.2.1", began_s=time.time() - 0.6))
-        assert "compared 120 min away" in rows(record, 1)[0].reason
+        assert "compared 120 min before" in rows(record, 1)[0].reason
         disciplined = mr_data_set("1.2.2", began_s=time.time() - 0.6)
         disciplined.AcquisitionTimeSynchronized = "Y"
         send(listener.port, disciplined)

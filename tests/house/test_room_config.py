@@ -52,7 +52,7 @@ def test_the_environment_overrides_the_file(tmp_path):
         (MINIMAL + "tolerance_mm =", "not valid TOML"),
         (
             MINIMAL + "[imaging.point_spread]\nkind = 'fermi'\nparameters = [0.9]",
-            "key imaging.point_spread: .*fermi takes 2 parameters, 1 are given",
+            "key imaging.point_spread: .*fermi takes 2 parameters, got 1",
         ),
         (
             MINIMAL + "[imaging.point_spread]\nkind = 'sinc'",

@@ -55,12 +55,15 @@ def test_scatter_is_reported_as_it_is():
 @pytest.mark.parametrize(
     ("readings", "named"),
     [
-        ([(100, 450.0), (-100, -450.0), (-100, -450.0)], "1 readings forward"),
+        (
+            [(100, 450.0), (-100, -450.0), (-100, -450.0)],
+            "at least 2 readings forward needed, got 1",
+        ),
         ([(100, 450.0), (100, -450.0)], "contradicts its sign"),
         ([(100, float("nan"))], "reading 1"),
         ([(0, 450.0)], "reading 1"),
         ([(100, 9000.0)], r"outside 0\.1\.\.20\.0 um"),
-        ([], "0 readings forward"),
+        ([], "at least 2 readings forward needed, got 0"),
     ],
 )
 def test_readings_that_make_no_sense_are_named(readings, named):

@@ -96,7 +96,7 @@ def test_times_that_are_not_true_are_found_out_and_nothing_is_written_of_the_clo
 def test_without_the_second_readout_the_polarity_is_not_known(session):
     imaging = find_imaging(session[:-1], IMAGING)
     assert imaging.polarity == 0
-    assert "sign of the readout changed" in imaging.template_problem
+    assert "readout direction reversed" in imaging.template_problem
     assert "readout_polarity" not in room_keys(find_clock(session), imaging).get("imaging", {})
 
 

@@ -8,7 +8,16 @@ import pytest
 from robot_bridge.protocol.phases import WorkPhase
 from service.room.proposals import Verdict
 from service.room.state import RobotState, RoomState
-from service.slicer.answers import acknowledge, answer, decision_of, verdict_of
+from service.slicer.allowance import Allowance, Allowances
+from service.slicer.answers import (
+    acknowledge,
+    answer,
+    concerns_us,
+    decision_of,
+    not_looked_at,
+    registered,
+    verdict_of,
+)
 from service.slicer.messages import Message, Point, points, string, transform
 from service.slicer.pose import Pose
 from service.slicer.reading import Received, Stream, matrix_of, stop_word, string_of
@@ -182,7 +191,7 @@ def listed(*named: tuple[str, tuple[float, float, float], str]) -> Message:
 
 
 def test_points_are_taken_by_label_never_by_index():
-    entry, target = ("entry", (1.0, 2.0, 60.0), ""), ("TARGET", (1.0, 2.0, 3.0), "Unselected")
+    entry, target = ("Entry 1", (1.0, 2.0, 60.0), ""), ("TARGET", (1.0, 2.0, 3.0), "Unselected")
     for order in ([entry, target], [target, entry], [("F-1", (0.0, 0.0, 0.0), ""), entry, target]):
         plan = said(listed(*order)).plan
         assert plan is not None
@@ -219,7 +228,10 @@ def test_points_that_are_no_plan_are_a_configuration_error(message):
 def test_a_registration_is_kept_and_a_tracked_tip_is_not():
     matrix = transform("CLB_3", 1.0, np.eye(3), (1.0, 2.0, 3.0))
     kept = said(matrix)
-    assert [one.device for one in kept.replies] == ["ACK_3", "CALIBRATION"]
+    assert [one.device for one in kept.replies] == ["ACK_3"]
+    for verdict, code in ((Verdict("recorded", ""), 1), (Verdict("too_many", "why"), 13)):
+        told = registered(verdict, 1.0)
+        assert (told.device, code_of(told)[0]) == ("CALIBRATION", code)
     assert np.allclose(np.array(kept.registration)[:, 3], (1.0, 2.0, 3.0))
     tip = said(transform("NPOS_3", 1.0, np.eye(3), (1.0, 2.0, 3.0)))
     assert (tip.replies[0].device, tip.plan, tip.registration) == ("ACK_3", None, None)
@@ -228,7 +240,36 @@ def test_a_registration_is_kept_and_a_tracked_tip_is_not():
 def test_what_is_not_for_the_robot_is_not_answered():
     other = transform("LinearTransform_1", 1.0, np.eye(3), (0.0, 0.0, 0.0))
     for message in (other, Message("STATUS", "", 1.0, bytes(31)), Message("IMAGE", "a", 1.0, b"")):
+        assert not concerns_us(received(message))
         assert said(message).replies == ()
+
+
+def test_a_flood_is_told_that_it_is_too_many_under_the_name_of_what_it_sent():
+    registration = transform("CLB_", 1.0, np.eye(3), (0, 0, 0))
+    flood = ((TGT, "TARGET"), (listed(), "TARGET"), (registration, "CALIBRATION"))
+    for message, name in flood:
+        assert concerns_us(received(message))
+        told = not_looked_at(received(message), 1.0)
+        assert code_of(told)[0] == 13
+        assert told.device == name
+        assert b"too_many" in told.content
+
+
+def test_a_machine_may_ask_ten_times_at_once_and_then_once_a_second():
+    at_s = [0.0]
+    one = Allowance(lambda: at_s[0])
+    assert [one.take() for _ in range(12)] == [True] * 10 + [False] * 2
+    at_s[0] = 1.1
+    assert [one.take(), one.take(), one.is_whole] == [True, False, False]
+    at_s[0] = 20.0
+    assert one.is_whole
+
+
+def test_the_allowance_is_a_machines_and_not_a_connections():
+    known = Allowances()
+    assert [known.of("10.0.0.7", "propose").take() for _ in range(11)] == [True] * 10 + [False]
+    assert known.of("10.0.0.7", "note_registration").take()
+    assert known.of("10.0.0.8", "propose").take()
 
 
 def test_where_inwards_is_off_everything_but_stop_is_denied():
@@ -247,10 +288,11 @@ def test_the_sender_is_told_what_the_room_makes_of_a_plan():
     assert waits[1].content == TGT.content
     unknown = verdict_of(plan, Verdict("proposed", "waits", 7), room())
     assert [one.device for one in unknown] == ["TARGET"]
-    codes = {"invalid": (10, 1), "out_of_reach": (10, 3), "too_many": (13, 0)}
+    codes = {"invalid": (10, 1), "out_of_reach": (10, 3), "too_many": (13, 0), "no_case": (13, 0)}
     for code, expected in codes.items():
         (told,) = verdict_of(plan, Verdict(code, "why"), room())
         assert code_of(told) == expected
+    assert b"no_case" in told.content
     refused = decision_of(7, "refused", "Olga", "vessel in the way", 1.0)
     assert code_of(refused) == (5, 0)
     assert b"refused by Olga: vessel in the way" in refused.content

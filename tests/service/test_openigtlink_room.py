@@ -446,7 +446,7 @@ def test_a_proposal_is_refused_and_another_accepted_by_clicking(room, port, brow
         since = screen.mark()
         screen.say("point", "L5", "ENTRY", ras(beside(client.state(), 4.0)), "TARGET", ras(wanted))
         expect(card.locator("li")).to_have_count(1)
-        card.get_by_role("button", name="Accept: as the fiducial appears").click()
+        card.get_by_role("button", name="Accept: target for the fiducial").click()
         screen.wait_for(lambda m: target_status(m) and m["name"] == "taken", since)
         expect(card).to_be_hidden()
         assert client.state().target_patient_mm == pytest.approx(wanted, abs=1e-3)

@@ -1,5 +1,6 @@
 """DICOM outputs say what the record says, are what the standard asks for, and are made once."""
 
+import shutil
 import subprocess
 import sys
 import zipfile
@@ -315,6 +316,52 @@ def test_an_output_that_is_there_is_not_made_again(record):
     made_ns = path.stat().st_mtime_ns
     assert make_output(record, READY_REPORT).stat().st_mtime_ns == made_ns
     assert not list(path.parent.glob("*.part"))
+
+
+@pytest.fixture(scope="module")
+def suzukis(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A case with a puncture by an operator of that name."""
+    with CaseRecord(make_case(tmp_path_factory.mktemp("suzuki"))) as record:
+        body = {"procedure_id": come_to_ready(record), "insertion_depth_mm": 40.0}
+        record.append_event("puncture", body, source="service", who="鈴木 花子")
+        return record.case_dir
+
+
+@pytest.mark.parametrize(
+    ("charset", "name"),
+    [
+        (["", "ISO 2022 IR 87"], "Yamada^Tarou=山田^太郎=やまだ^たろう"),
+        (["ISO 2022 IR 13", "ISO 2022 IR 87"], "ﾔﾏﾀﾞ^ﾀﾛｳ=山田^太郎=やまだ^たろう"),
+        ("ISO_IR 192", "Yamada^Tarou=山田^太郎=やまだ^たろう"),
+        ("ISO_IR 100", "Müller^Jörg"),
+        (None, "Miller^George"),
+    ],
+)
+def test_names_are_written_as_they_are_whatever_the_alphabet(suzukis, tmp_path, charset, name):
+    """The patient's, in that of the slices, and the operator's, which that may not have."""
+    with CaseRecord(shutil.copytree(suzukis, tmp_path / "case")) as record:
+        for row in record.slices(state="assigned"):
+            source = pydicom.dcmread(record.case_dir / row.path)
+            del source.SpecificCharacterSet
+            if charset is not None:
+                source.SpecificCharacterSet = charset
+            source.PatientName = name
+            source.StudyDescription = name.split("=")[-1]
+            source.save_as(record.case_dir / row.path)
+        (event,) = record.events_of_kind("puncture")
+        outputs = [
+            READY_PRESENTATION,
+            Output("measurement", 1, "image"),
+            Output("puncture", event.event_id, "report"),
+        ]
+        for output in outputs:
+            path = make_output(record, output)
+            read = pydicom.dcmread(path)
+            assert str(read.PatientName) == name
+            if shutil.which("dciodvfy"):
+                said = subprocess.run(["dciodvfy", path], capture_output=True, text=True).stderr
+                assert "haracter" not in said.replace("99AUTOSPINE", ""), said
+        assert any("鈴木 花子" in item.get("TextValue", "") for item in group_of(read))
 
 
 def test_all_uids_are_different_and_only_reports_have_a_series_of_their_own(record):

@@ -283,6 +283,23 @@ def test_the_clocks_are_compared_by_typing_what_the_scanner_shows(
     client.compare_clocks(-37.2, 0.02)
 
 
+def test_a_comparison_that_slices_have_made_doubtful_says_so_until_the_clocks_are_compared_again(
+    page: Page, state: RoomState, client: RoomClient, room: AttendedRoom
+) -> None:
+    client.compare_clocks(-37.2, 0.02)
+    card = page.locator("#scanner-clock")
+    expect(card).not_to_contain_text("Doubted")
+    doubt = {"scanner": "MR 1", "text": "it arrived 3.0 s sooner", "is_certain": False}
+    with CaseRecord(room.folder) as record:
+        record.append_event("clock_doubted", {**doubt, "at_s": time.time()}, source="listener")
+    expect(card.locator(".wrong")).to_contain_text(
+        "Doubted: compare again (MR 1: it arrived 3.0 s sooner). Until then slices are pending."
+    )
+    expect(page.locator("#alarms")).to_contain_text("The scanner's clock is doubted")
+    client.compare_clocks(-37.2, 0.02)
+    expect(card).not_to_contain_text("Doubted")
+
+
 def test_slices_that_will_not_come_are_given_up_where_slices_were_set_aside(
     page: Page, state: RoomState, client: RoomClient
 ) -> None:

@@ -7,8 +7,12 @@ from recorded_case import make_case
 from case_record.record import CaseRecord
 from dicom_listener.belonging import ACCEPTED, BOUND, event_body
 from dicom_slice.patient import Identity
+from dicom_slice.plan import plan_in
+from service.dicom_out.content import plan_events
+from service.dicom_out.errors import OutputError
+from service.dicom_out.make import make_output, plans_to_send
 from service.dicom_out.plan_object import plan_of
-from service.procedure.targets import ENTRY_SET, TARGET_SET
+from service.procedure.targets import ENTRY_SET, TARGET_SET, TARGET_WITHDRAWN
 
 
 @pytest.fixture
@@ -58,3 +62,25 @@ def test_the_plan_writes_the_patients_name_as_the_slices_do(record, tmp_path, ch
     made = plan_of(record, event)
     made.save_as(tmp_path / "plan.dcm", enforce_file_format=True)
     assert str(pydicom.dcmread(tmp_path / "plan.dcm").PatientName) == name
+
+
+def test_a_target_that_was_withdrawn_is_contradicted_and_what_was_never_set_is_not(record):
+    def note(kind, body):
+        return record.append_event(kind, body, source="service", who="Olga")
+
+    (set_before,) = record.events_of_kind(TARGET_SET) or [None]
+    assert set_before is None
+    never_set = note(TARGET_WITHDRAWN, {})
+    assert plan_events(record) == []
+    note(TARGET_SET, {"patient_mm": [1.0, 2.0, 3.0]})
+    withdrawn = note(TARGET_WITHDRAWN, {})
+    note(ENTRY_SET, {"patient_mm": [9.0, 9.0, 99.0]})
+    assert never_set not in [event.event_id for event in plan_events(record)]
+    (last,) = [o for o in plans_to_send(record) if o.number == withdrawn]
+    path = make_output(record, last)
+    (group,) = pydicom.dcmread(path).FiducialSetSequence
+    assert [point.FiducialIdentifier for point in group.FiducialSequence] == ["WITHDRAWN"]
+    told = plan_in(path, made_by_us="somebody else")
+    assert told is None, "it proposes nothing"
+    with pytest.raises(OutputError, match="not a change of the plan"):
+        plan_of(record, never_set)

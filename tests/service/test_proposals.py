@@ -11,7 +11,7 @@ from openigtlink_station import station
 from case_record.cases import Cases
 from dicom_listener.belonging import ACCEPTED, BOUND, event_body
 from dicom_slice.patient import Identity
-from service.room.proposals import Plan
+from service.room.proposals import MOST_OF_ONE, OPENIGTLINK, Plan
 from service.room.readiness import ConflictError
 from service.slicer.server import OpenIgtLinkServer, bind_openigtlink
 
@@ -109,6 +109,76 @@ def test_a_frame_of_reference_that_no_slice_confirms_yet_is_not_accepted(tmp_pat
         assert room.later().target_patient_mm == place
 
 
+def sent_from(sender, **more):
+    return Plan(**{"sender": sender, "name": "T", "via": OPENIGTLINK, "target_mm": None} | more)
+
+
+def test_a_machine_that_connects_again_and_again_takes_nobody_elses_place(tmp_path):
+    place = patient_mm(41.0, 58.0)
+    with running_line_room(tmp_path) as room:
+        other = room.call("propose", plan=sent_from("10.0.0.8:4000", target_mm=place))
+        codes = [
+            room.call("propose", plan=sent_from(f"10.0.0.7:{5000 + n}", target_mm=place)).code
+            for n in range(12)
+        ]
+        assert codes == ["proposed"] * MOST_OF_ONE + ["too_many"] * (12 - MOST_OF_ONE)
+        third = room.call("propose", plan=sent_from("fe80::9:4000", target_mm=place))
+        assert third.code == "proposed"
+        open_now = [p.number for p in room.later().proposals if p.state == "open"]
+        assert {other.number, third.number} < set(open_now)
+        assert len(open_now) == MOST_OF_ONE + 2
+
+
+TARGET, ENTRY = patient_mm(41.0, 58.0), (58.0, -50.0, -41.0)
+
+
+def test_a_target_and_an_entry_that_a_station_sends_apart_are_one_plan(tmp_path):
+    own, other = "10.0.0.7:5000", "10.0.0.7:5001"
+    with running_line_room(tmp_path) as room:
+
+        def propose(sender=own, **more):
+            number = room.call("propose", plan=sent_from(sender, **more)).number
+            return next(p for p in room.until(lambda s: knows(s, number)).proposals[::-1])
+
+        def knows(state, number):
+            return any(p.number == number for p in state.proposals)
+
+        first = propose(target_mm=TARGET, direction=(0.0, -1.0, 0.0))
+        strangers = propose(other, name="E", entry_mm=ENTRY)
+        assert strangers.target_mm is None
+        both = propose(name="E", entry_mm=ENTRY)
+        assert (both.target_mm, both.entry_mm, both.name) == (TARGET, ENTRY, "T")
+        assert both.direction is None
+        assert propose(name="E", entry_mm=ENTRY).number == both.number, "the same again"
+        moved = propose(name="T2", target_mm=patient_mm(42.0, 58.0))
+        assert (moved.target_mm, moved.entry_mm) == (patient_mm(42.0, 58.0), ENTRY)
+        states = {p.number: p.state for p in room.later().proposals}
+        assert states[first.number] == states[both.number] == "joined"
+        room.call("refuse_proposal", number=moved.number, why="no")
+        assert propose(name="E", entry_mm=ENTRY).target_mm is None, "what was refused is over"
+
+
+def test_a_half_from_before_the_table_moved_joins_no_other(tmp_path):
+    with running_line_room(tmp_path) as room:
+        room.calibrate()
+        plan = sent_from("10.0.0.7:5000", target_mm=TARGET)
+        room.call("propose", plan=plan)
+        bind(room, BOUND, "1.2.9")
+        bind(room, ACCEPTED, "1.2.8", "1.2.4")
+        room.call("propose", plan=sent_from("10.0.0.7:5000", entry_mm=ENTRY))
+        new = room.until(lambda s: len(s.proposals) == 2).proposals[-1]
+        assert (new.target_mm, new.entry_mm) == (None, ENTRY)
+
+
+def test_a_plan_of_one_message_is_replaced_as_a_whole(tmp_path):
+    with running_line_room(tmp_path) as room:
+        whole = sent_from("10.0.0.7:5000", target_mm=TARGET, entry_mm=ENTRY)
+        room.call("propose", plan=whole)
+        room.call("propose", plan=sent_from("10.0.0.7:5000", target_mm=TARGET))
+        before, now = room.until(lambda s: len(s.proposals) == 2).proposals
+        assert (before.state, now.entry_mm) == ("replaced", None)
+
+
 def test_a_direction_that_cannot_be_used_yet_is_not_accepted(tmp_path):
     plan = Plan("station", "TGT_1", "OpenIGTLink", (10.0, 20.0, 30.0), None, (0.0, -1.0, 0.0))
     with running_line_room(tmp_path, GUIDE) as room:
@@ -184,3 +254,51 @@ def test_a_sender_is_told_of_its_own_proposal_and_of_its_end_with_the_case(tmp_p
         assert second.wait_for(about_plans, since_second)["name"] == "taken"
         first.next_beats()
         assert not [one for one in first.heard[since:] if about_plans(one)]
+
+
+def test_without_a_case_the_answer_says_so_and_not_that_it_was_too_much(tmp_path):
+    with (
+        running_line_room(tmp_path, INWARDS, many_cases=True) as room,
+        served(room) as port,
+        station("own", port) as peer,
+    ):
+        peer.say("point", "Plan", "TARGET", "10 20 30")
+        told = peer.wait_for(about_plans)
+        assert (told["code"], told["name"]) == (13, "no_case")
+        assert "No case is open" in told["text"]
+
+
+def test_registrations_of_one_machine_do_not_fill_the_record(tmp_path):
+    """Each under a name of its own, from a new connection."""
+    pose = "1 0 0 10 0 1 0 20 0 0 1 30"
+    with running_line_room(tmp_path, INWARDS) as room, served(room) as port:
+        told = []
+        for number in range(14):
+            with station("own", port) as peer:
+                peer.say("transform", f"CLB_{number}", pose)
+                told.append(peer.wait_for(lambda m: m["device"] == "CALIBRATION"))
+        with room.record() as record:
+            kept = record.events_of_kind("registration_received")
+        assert len(kept) == sum(one["code"] == 1 for one in told) < 14
+        assert {(one["code"], one["name"]) for one in told} == {
+            (1, "CALIBRATION"),
+            (13, "too_many"),
+        }
+
+
+def test_both_halves_of_a_plan_are_answered_as_one(tmp_path):
+    with (
+        running_line_room(tmp_path, INWARDS) as room,
+        served(room) as port,
+        station("own", port) as peer,
+    ):
+        peer.say("point", "T", "Target_1", "10 20 30")
+        assert peer.wait_for(about_plans)["name"] == "proposed"
+        since = peer.mark()
+        peer.say("point", "E", "Entry", "10 20 60")
+        assert "as one plan" in peer.wait_for(about_plans, since)["text"]
+        peer.next_beats()
+        assert len([one for one in peer.heard[since:] if about_plans(one)]) == 1
+        (one,) = [p for p in room.later().proposals if p.state == "open"]
+        assert one.target_mm is not None
+        assert one.entry_mm is not None

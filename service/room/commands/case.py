@@ -51,7 +51,7 @@ class CaseCommands:
         room, cases = self._room, self._life.cases
         cases.check_may_change()
         if room.record.running_procedure() is not None:
-            raise ConflictError("busy", "A procedure is running: wait until it ends, or abort it.")
+            raise ConflictError("busy", "A procedure is running: let it finish, or end it.")
         status = room.link.status
         locked = status is not None and status.insertion_locked
         if locked or needle_may_be_in(room.record):
@@ -107,7 +107,7 @@ class CaseCommands:
         if self._room.record.running_procedure() is not None:
             raise ConflictError(
                 "busy",
-                "A procedure is running: end it first, because it relies on the slices so far.",
+                "A procedure is running and relies on the slices used so far: end it first.",
             )
 
     def all(self) -> tuple[Callable[..., Any], ...]:

@@ -16,7 +16,6 @@ from service.procedure.scan_frame import newest_frame
 from service.room.commands.target import TargetCommands
 from service.room.context import RoomContext
 from service.room.proposals import (
-    MOST_OPEN,
     PROPOSED,
     REFUSED,
     SCAN_FRAME,
@@ -31,7 +30,9 @@ from service.room.proposals import (
     why_not_in_bore,
     why_other_frame,
     why_senseless,
+    why_too_many,
     why_void,
+    with_other_half,
 )
 from service.room.reach import OutOfReachError, ReachUnknownError, check_reach, entry_of
 from service.room.readiness import ConflictError
@@ -116,7 +117,9 @@ class ProposalCommands:
 
         received: the event by which it came, if it came by DICOM.
         """
+        self._withdraw_void()  # a half for where the table lay before joins no other
         known = self._book.update(self._room.record)
+        plan = with_other_half(plan, known)
         mine = [one for one in known if one.state == "open" and _same(one, plan)]
         if mine:
             return self._waiting(mine[0], reach_known=not mine[0].note)
@@ -143,11 +146,8 @@ class ProposalCommands:
         )
         if why:
             return Verdict("invalid", why)
-        others = [one for one in known if one.state == "open" and one.sender != plan.sender]
-        if len(others) >= MOST_OPEN:
-            return Verdict(
-                "too_many", f"{len(others)} proposals are already waiting for the operator"
-            )
+        if why := why_too_many(plan, known):
+            return Verdict("too_many", why)
         if why := why_not_in_bore(plan):
             return Verdict("out_of_reach", why)
         try:
@@ -169,7 +169,7 @@ class ProposalCommands:
         why = why_other_frame(one.frame_of_reference_uid, here) or self._why_void(number)
         if one.frame_of_reference_uid and not here:
             why = (
-                "nobody can tell yet whether it is meant for the table as it lies: acquire a slice"
+                "whether the table has moved since it was planned is not known yet: acquire a slice"
             )
         if why:
             raise ConflictError("other_frame", f"Not accepted: {why}.")
@@ -246,4 +246,5 @@ def _same(one: ProposalState, plan: Plan) -> bool:
 
 def _waits(one: ProposalState) -> str:
     note = f"; {one.note}" if one.note else ""
-    return f"proposal {one.number} is waiting for the operator{note}"
+    both = ", target and entry point as one plan" if one.apart else ""
+    return f"proposal {one.number} is waiting for the operator{both}{note}"

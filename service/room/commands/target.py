@@ -128,7 +128,7 @@ class TargetCommands:
             return
         question = self._room.execution.question
         if running.name not in APPROACHES or question is None or question.plan is None:
-            raise ConflictError("busy", "Abort the running procedure before changing the target.")
+            raise ConflictError("busy", "End the running procedure before changing the target.")
         reason = (
             f"the {what} by {by} while a move was waiting for confirmation; the move was not "
             "made. Start the approach again"

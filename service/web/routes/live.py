@@ -48,7 +48,9 @@ def live_router(loop: ControlLoop, broadcast: Broadcast) -> APIRouter:
         """The state whenever it changes, every event of the record after the given one."""
         if broadcast.viewers >= MOST_VIEWERS:
             wait = {"Retry-After": "5"}
-            raise ProblemError(429, "busy", f"{MOST_VIEWERS} are already watching.", wait)
+            raise ProblemError(
+                429, "busy", f"{MOST_VIEWERS} screens are already open: close one.", wait
+            )
         if last_event_id is not None and last_event_id.isdecimal():
             after = min(int(last_event_id), MOST_ID)
         headers = {"Cache-Control": "no-store", "X-Accel-Buffering": "no"}
