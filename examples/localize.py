@@ -1,10 +1,14 @@
 """The round objects in DICOM files: centre ± σ in pixels, and where that is in the patient.
 
+± is of the noise; what the shape does to the centre, if it is no disc, is said apart.
+
 python examples/localize.py PATH…  [--radius-mm 3,12]
 """
 
 import argparse
 from pathlib import Path
+
+import numpy as np
 
 from dicom_slice.read import dicom_files, read_frames
 from sr_engine.errors import EngineError
@@ -26,8 +30,10 @@ for file in dicom_files(arguments.path):
             continue
         for one in found:
             row, col = one.centre_px
+            noise_row, noise_col = np.sqrt(np.diag(one.covariance_px2))
             x, y, z = header.geometry.patient_from_pixel(one.centre_px)
             print(
-                f"{file.name}: row {row:.3f} ± {one.sigma_px[0]:.3f} px, "
-                f"col {col:.3f} ± {one.sigma_px[1]:.3f} px, at ({x:.2f}, {y:.2f}, {z:.2f}) mm"
+                f"{file.name}: row {row:.3f} ± {noise_row:.3f} px, "
+                f"col {col:.3f} ± {noise_col:.3f} px (its shape: "
+                f"± {max(one.systematic_px):.3f} px), at ({x:.2f}, {y:.2f}, {z:.2f}) mm"
             )

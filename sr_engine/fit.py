@@ -6,7 +6,7 @@ correlation that the filter gives it. Levenberg-Marquardt with analytic derivati
 takes the weights, the noise level and the mask of odd pixels from the fit before it.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property
 
 import numpy as np
@@ -63,6 +63,7 @@ class DiscFit:
     n_masked: int
     explained: float  # chi2 that the object takes away, against background and slopes alone
     residual: Array  # (rows, cols) pixels less what is expected of them; 0 where none counts
+    systematic_px: Array = field(default_factory=lambda: np.zeros(2))  # see `lopsided`
 
     @property
     def centre_px(self) -> Array:

@@ -15,7 +15,7 @@ class Localization:
     """Centre of the fiducial in the reference pose, and how well it is known.
 
     centre_px: (row, col), pixel (0, 0) has its centre at (0.0, 0.0).
-    covariance_px2: (2, 2) of the centre, row and col.
+    covariance_px2: (2, 2) by noise, row and col: what counts between places seen by one method.
     radius_px, amplitude, background, snr: means over the frames; amplitude is negative for an
       object darker than what surrounds it; snr = |amplitude| / noise std per channel.
     residuals_px: (N, 2), what each frame's centre less its shift differs by from centre_px.
@@ -23,7 +23,7 @@ class Localization:
       frame, of its pixels against the model.
     psf: point spread of the fit; None where the object's own image was fitted.
     systematic_px: std (row, col) of what is common to all poses, beside covariance_px2: it cancels
-      between places seen by the same method, and counts where the centre itself does.
+      between places seen by the same method, and counts where the centre itself does: sigma_px.
     """
 
     centre_px: Array
@@ -42,5 +42,7 @@ class Localization:
 
     @property
     def sigma_px(self) -> Array:
-        """Standard deviations (row, col)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance_px2)))
+        """Standard deviations (row, col) of the centre itself: noise and what is systematic."""
+        noise = np.sqrt(np.diag(self.covariance_px2))
+        common = 0.0 if self.systematic_px is None else self.systematic_px
+        return np.asarray(np.hypot(noise, common))

@@ -133,11 +133,14 @@ def localize(
             fit = fit if whole is None else _widened_by_mask(fit, whole)
         if not psf.folds:  # what a camera folds differs from pixel to pixel, and draws no edge
             fit = with_lopsidedness(fit, pixels, level)
+            if not fit.sigma < MISFIT * level:
+                fit = _widened_by_misfit(fit)
         _refuse_doubtful(fit, begin, frame.shape)
         fits.append(fit)
         guess = (*(fit.centre_px - shift), fit.outer_px)
     radius = float(np.mean([fit.outer_px for fit in fits]))
-    result = combined(fits, shifts, radius, shift_sigma_px, psf=psf)
+    common = np.sqrt(np.mean([fit.systematic_px**2 for fit in fits], axis=0))
+    result = combined(fits, shifts, radius, shift_sigma_px, psf=psf, systematic_px=common)
     _refuse_outside_gate(result.centre_px, start, gate_px)
     return result
 
@@ -213,6 +216,14 @@ def _widened_by_mask(fit: DiscFit, whole: DiscFit) -> DiscFit:
     covariance = fit.covariance.copy()
     covariance[:2, :2] += np.outer(apart, apart)
     return replace(fit, covariance=covariance)
+
+
+def _widened_by_misfit(fit: DiscFit) -> DiscFit:
+    """Of what is no disc another frame may show another centre: one frame does not tell how much
+    of what draws it is common to all, so half of it counts to each."""
+    covariance = fit.covariance.copy()
+    covariance[:2, :2] += np.diag(fit.systematic_px**2) / 2
+    return replace(fit, covariance=covariance, systematic_px=fit.systematic_px / np.sqrt(2))
 
 
 def _recognised(

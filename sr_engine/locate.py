@@ -43,13 +43,15 @@ FARTHEST_PX = 2.0  # that a fit may go from its candidate, or a third of the rad
 class Located:
     """One round object of a slice.
 
-    centre_px (row, col) with covariance_px2 (2, 2); radius_px of the inner edge where there is a
+    centre_px (row, col) with covariance_px2 (2, 2) by noise, and systematic_px, std (row, col) of
+    what its shape does beside it, see `lopsided`; radius_px of the inner edge where there is a
     wall (wall_px thick, 0 for none); amplitude over the surroundings, negative if darker.
     snr: largest step at the edge over the noise, which includes what the model does not describe.
     """
 
     centre_px: Array
     covariance_px2: Array
+    systematic_px: Array
     radius_px: float
     wall_px: float
     amplitude: float
@@ -61,8 +63,8 @@ class Located:
 
     @property
     def sigma_px(self) -> Array:
-        """Standard deviations (row, col)."""
-        return np.asarray(np.sqrt(np.diag(self.covariance_px2)))
+        """Standard deviations (row, col) of the centre itself: noise and what is systematic."""
+        return np.asarray(np.hypot(np.sqrt(np.diag(self.covariance_px2)), self.systematic_px))
 
 
 def locate_all(
@@ -189,6 +191,7 @@ def _located(fit: DiscFit, candidate: Candidate, psf: Psf) -> Located:
     return Located(
         centre_px=fit.centre_px,
         covariance_px2=fit.covariance_px2,
+        systematic_px=fit.systematic_px,
         radius_px=fit.radius_px,
         wall_px=fit.wall_px,
         amplitude=fit.amplitude,

@@ -129,6 +129,8 @@ def localize_request(
         raise TemplateError(f"no template: {why_not}; and no disc: {error}") from error
     if learnt is not None:  # what the two mean by the fiducial's middle differs by this
         doubt = np.diag(np.square(learnt.template.systematic_px))
+        if disc.systematic_px is not None:
+            doubt += np.diag(np.square(disc.systematic_px))
         disc = replace(
             disc,
             covariance_px2=disc.covariance_px2 + doubt,

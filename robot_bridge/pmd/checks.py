@@ -4,7 +4,7 @@ from robot_bridge.daemon.config import AxisConfig
 from robot_bridge.daemon.motors import MotorError
 from robot_bridge.pmd.axis import PmdAxis
 from robot_bridge.pmd.controller import AxisFaultError
-from robot_bridge.pmd.protocol import PmdEchoError, PmdError, PmdTimeoutError
+from robot_bridge.pmd.protocol import PmdCommandError, PmdEchoError, PmdError, PmdTimeoutError
 
 
 def check_setpoint(axis: AxisConfig, setpoint_um: int) -> None:
@@ -60,6 +60,7 @@ def check_run(axis: PmdAxis, steps: int) -> None:
 _CODES: dict[type[PmdError], str] = {
     PmdTimeoutError: "no_answer",
     PmdEchoError: "damaged_command",
+    PmdCommandError: "bad_command",
 }
 
 

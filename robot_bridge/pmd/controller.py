@@ -96,9 +96,12 @@ class PmdController:
         self.settings: dict[int, int] = {}  # Y numbers as they were set and read back
         self.tells_index = False
         self.seeks_index = False  # homing has armed it
+        self._index_passed = False  # or perhaps: an answer was not heard
         self.index_trapped = False  # it may have reset the count, or stopped the motor
         # One wrong bit makes `T0` (go to zero) of `U0`, but a harmless question of a bare `U`.
         self.status_body = "U"
+        self._answered: set[str] = set()
+        self._silent_to: set[str] = set()
         self._supply_due_s = 0.0
         self._asked_in_vain = False  # what an answer told that nobody heard, it does not tell again
 
@@ -137,20 +140,46 @@ class PmdController:
         return reply
 
     def ask_if_it_can(self, name: str, otherwise: str) -> Steps[Reply | None]:
-        """None, and a doubt for people to read, if this board does not answer that."""
-        try:
-            reply = yield from self.ask(name)
-        except PmdNoValueError:
-            reply = None
-        except PmdTimeoutError:
-            raise
-        except PmdError:
-            reply = None
+        """None, and a doubt for people to read, if this board does not answer that.
+
+        What it was silent to is not asked again; what it has answered before, it can.
+        """
+        reply = None
+        if name not in self._silent_to:
+            try:
+                reply = yield from self.ask(name)
+            except PmdTimeoutError as error:
+                if name in self._answered:
+                    raise
+                yield from self.must_live(error)
+                self._silent_to.add(name)
+            except PmdError:
+                pass
         if reply is None:
             self.doubts[name] = otherwise
             return None
+        self._answered.add(name)
         self.doubts.pop(name, None)
         return reply
+
+    def must_live(self, error: PmdTimeoutError) -> Steps[None]:
+        """A board that is silent to one question answers another; else it is the line, or dead."""
+        if isinstance(error, PmdNoValueError):
+            return
+        try:
+            yield from self.ask("E")
+        except PmdNoValueError:
+            pass
+        except PmdTimeoutError:
+            raise error from None
+        except PmdError:
+            pass
+
+    def begin_anew(self) -> None:
+        """Forget what it was seen to answer or not."""
+        self.doubts = {}
+        self._answered.clear()
+        self._silent_to.clear()
 
     def read_status(self) -> Steps[Status]:
         unheard, self._asked_in_vain = self._asked_in_vain, True
@@ -168,7 +197,7 @@ class PmdController:
             self.status |= Status.RESET  # the answer that told it was lost
         passed = self.status & Status.INDEX or (self.tells_index and (reply.retried or unheard))
         if passed and self.closed_loop and not (self.seeks_index or self.needs_setup):
-            yield from self._look_for_index()
+            self._index_passed = True  # asked about when there is time: not while stopping
         self._asked_in_vain = False
         if self.status & Status.RESET:
             self.needs_setup = True
@@ -187,10 +216,12 @@ class PmdController:
         if not self.believes_mark and self.mark == DECLARED_MARK:
             yield from self.set_mark(INITIALISED_MARK)
 
-    def _look_for_index(self) -> Steps[None]:
+    def look_for_index(self) -> Steps[None]:
         """Somebody may have armed it; then passing it has reset the count, or stopped the motor."""
-        self.index_trapped = True
+        if not self._index_passed:
+            return
         mode = (yield from self.ask("N")).integer() if self.tells_index else None
+        self._index_passed = False
         self.index_trapped = mode != INDEX_OFF
         if self.index_trapped:
             self.needs_setup = True
@@ -235,6 +266,7 @@ class PmdController:
 
     def check_status(self) -> Steps[None]:
         """Raise AxisFaultError for whatever the status says is wrong."""
+        yield from self.look_for_index()
         status = self.status
         if status & Status.RESET or (self.parked and self.expected_parked is False):
             self.certain = False

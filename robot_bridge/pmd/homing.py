@@ -13,14 +13,13 @@ from robot_bridge.pmd import units as pmd_units
 from robot_bridge.pmd.axis import PmdAxis
 from robot_bridge.pmd.controller import INDEX_HAS_RESET, INDEX_RESETS, AxisFaultError, Steps
 from robot_bridge.pmd.line import Procedure
-from robot_bridge.pmd.progress import FOLLOWS, agrees, disagreement
+from robot_bridge.pmd.progress import FOLLOWS, STANDS, agrees, disagreement
 from robot_bridge.pmd.protocol import Command
 from robot_bridge.pmd.setup import INDEX_POSITION, disarm_index, verify
 from robot_bridge.pmd.status import Inputs
 
 CHUNK_UM = 2000.0  # of a run towards a mechanical end, between two looks at the encoder
-BACK_OFF_UM, PULL_OFF_UM = 1000.0, 500.0
-STANDS = 0.2  # of the way that the motor's steps should make
+BACK_OFF_UM, PULL_OFF_UM, BACK_OFF_S = 1000.0, 500.0, 1.0
 
 
 def home(axis: PmdAxis, home_um: int) -> Procedure:
@@ -61,8 +60,9 @@ def _search_um(axis: PmdAxis) -> float:
     return HOMING_OVERTRAVEL * (axis.config.travel_max_um - axis.config.travel_min_um)
 
 
-def _run(axis: PmdAxis, distance_um: float) -> Steps[None]:
-    yield from axis.run_open_loop(pmd_units.microsteps_from_um(axis.config, distance_um))
+def _run(axis: PmdAxis, distance_um: float, speed_hz: int | None = None) -> Steps[None]:
+    microsteps = pmd_units.microsteps_from_um(axis.config, distance_um)
+    yield from axis.run_open_loop(microsteps, speed_hz)
 
 
 # --- limit switches ---------------------------------------------------------------------------
@@ -80,6 +80,7 @@ def _home_to_switch(axis: PmdAxis, home_um: int) -> Steps[None]:
             f"the {on} limit switch is on before the run: it is stuck or wired the wrong way "
             "round, or the axis is on it (jog off it first)",
         )
+    yield from axis.read_position()
     if not (yield from _run_to_switch(axis, outwards * _search_um(axis))):
         raise _cannot(axis, f"no limit switch after {_search_um(axis) / 1000:.1f} mm")
     there = yield from axis.read_inputs()
@@ -87,40 +88,69 @@ def _home_to_switch(axis: PmdAxis, home_um: int) -> Steps[None]:
         wrong = other if _is_on(there, other) else "no"
         raise _cannot(axis, f"the run {name} was stopped, and {wrong} limit switch is now on")
     yield from axis.read_position()
-    at_um = axis.position_um
-    yield from _leave(axis, -outwards * min(BACK_OFF_UM, _search_um(axis) / 4), name)
-    yield from _expect_encoder(axis, at_um, -outwards * min(BACK_OFF_UM, _search_um(axis) / 4))
-    if not (yield from _run_to_switch(axis, outwards * 2 * BACK_OFF_UM)):
+    first_um, back_um = axis.position_um, min(BACK_OFF_UM, _search_um(axis) / 4)
+    yield from _leave(axis, -outwards * back_um, name)
+    if not (yield from _run_to_switch(axis, outwards * 2 * back_um, _slow_hz(axis))):
         raise _cannot(axis, f"the {name} limit switch did not trip again")
-    yield pmd_protocol.stop(axis.address)
-    yield from axis.declare(home_um)
-    # Off the switch again, or the next homing could not tell it from one that is stuck.
-    yield from _run(axis, -outwards * PULL_OFF_UM)
     yield from axis.read_position()
-    axis.at_rest_um = axis.position_um
+    second_um = axis.position_um
+    if abs(second_um - first_um) > _trips_within_um(axis, back_um):
+        raise _cannot(
+            axis,
+            f"the {name} limit switch tripped {second_um - first_um:+.0f} um away the second time: "
+            "it is loose or intermittent",
+        )
+    # Off the switch again, or the next homing could not tell it from one that is stuck.
+    yield from _leave(axis, -outwards * min(PULL_OFF_UM, back_um), name)
+    yield pmd_protocol.stop(axis.address)
+    yield from axis.declare(home_um + axis.position_um - second_um)
+
+
+def _slow_hz(axis: PmdAxis) -> int:
+    """So that backing off lasts, and its time tells its length of an axis without encoder."""
+    step_um = max(axis.config.step_um_forward, axis.config.step_um_reverse)
+    return max(1, min(axis.speed_hz, round(BACK_OFF_UM / step_um / BACK_OFF_S)))
+
+
+def _trips_within_um(axis: PmdAxis, back_um: float) -> float:
+    """How far two trips of the same switch may seem to differ."""
+    least_um = max(axis.config.tolerance_um, axis.jitter_um)
+    if axis.closed_loop:
+        return least_um
+    return least_um + 2 * axis.config.step_error * back_um + (axis.within_um or 0.0)
 
 
 def _is_on(inputs: Inputs, name: str) -> bool:
     return inputs.forward if name == "forward" else inputs.reverse
 
 
-def _run_to_switch(axis: PmdAxis, distance_um: float) -> Steps[bool]:
-    """Whether a limit switch ended the run."""
+def _run_to_switch(axis: PmdAxis, distance_um: float, speed_hz: int | None = None) -> Steps[bool]:
+    """Whether a limit switch ended the run. Raises AxisFaultError if something else did."""
+    microsteps = pmd_units.microsteps_from_um(axis.config, distance_um)
     try:
-        yield from _run(axis, distance_um)
+        stood = yield from axis.run_while_followed(microsteps, speed_hz)
     except AxisFaultError as error:
         if error.code != "external_limit":
             raise
         yield pmd_protocol.stop(axis.address)  # needed before it goes the other way
         return True
+    if stood:
+        raise _cannot(axis, "the encoder no longer follows: the stage is blocked, or it is dead")
     return False
 
 
 def _leave(axis: PmdAxis, distance_um: float, name: str) -> Steps[None]:
-    if (yield from _run_to_switch(axis, distance_um)) or _is_on(
-        (yield from axis.read_inputs()), name
-    ):
+    from_um = axis.position_um
+    try:
+        yield from _run(axis, distance_um, _slow_hz(axis))
+        tripped = False
+    except AxisFaultError as error:
+        if error.code != "external_limit":
+            raise
+        tripped = True
+    if tripped or _is_on((yield from axis.read_inputs()), name):
         raise _cannot(axis, f"the {name} limit switch stays on when the axis leaves it")
+    yield from _expect_encoder(axis, from_um, distance_um)
 
 
 def _expect_encoder(axis: PmdAxis, from_um: float, distance_um: float) -> Steps[None]:
@@ -161,10 +191,11 @@ def _run_to_end(axis: PmdAxis, outwards: int, search_um: float) -> Steps[None]:
     while gone_um < search_um:
         yield from axis.read_position()
         from_um = axis.position_um
-        yield from _run(axis, outwards * CHUNK_UM)
+        microsteps = pmd_units.microsteps_from_um(axis.config, outwards * CHUNK_UM)
+        stands = yield from axis.run_while_followed(microsteps)
         yield from axis.read_position()
         moved_um = axis.position_um - from_um
-        if abs(moved_um) < STANDS * CHUNK_UM:
+        if stands or abs(moved_um) < STANDS * CHUNK_UM:
             return
         if outwards * moved_um < 0 or abs(moved_um) > CHUNK_UM / FOLLOWS:
             raise _cannot(axis, disagreement(moved_um, outwards * CHUNK_UM))
@@ -208,7 +239,7 @@ def _search_index(axis: PmdAxis, distance_um: float) -> Steps[bool]:
     try:
         yield Command(axis.address, f"N{INDEX_RESETS}", reads=False)
         try:
-            yield from axis.run_to_index(microsteps)
+            yield from axis.run_while_followed(microsteps, to_index=True)
         except AxisFaultError as error:
             if error.code != "external_limit":
                 raise

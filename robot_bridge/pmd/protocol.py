@@ -49,7 +49,7 @@ class PmdRefusedError(PmdError):
     """The controller understood and cannot do it now (`!`); a parked motor unparks instead."""
 
 
-class PmdCommandError(ValueError):
+class PmdCommandError(PmdError, ValueError):
     """The command cannot be formed: our own fault (local), nothing was sent."""
 
 

@@ -267,14 +267,16 @@ def _of_size(
 
 
 def _row(one: Localization | Located, header: Slice, files: Sequence[Path]) -> dict[str, Any]:
-    sigma = np.sqrt(np.diag(one.covariance_px2))
+    common = np.zeros(2) if one.systematic_px is None else one.systematic_px
     patient_mm = geometry_of(header, files[0]).patient_from_pixel(one.centre_px)
     return {
         "row": float(one.centre_px[0]),
         "col": float(one.centre_px[1]),
         "radius_px": float(one.radius_px),
-        "sigma_row_px": float(sigma[0]),
-        "sigma_col_px": float(sigma[1]),
+        "sigma_row_px": float(one.sigma_px[0]),
+        "sigma_col_px": float(one.sigma_px[1]),
+        "systematic_row_px": float(common[0]),
+        "systematic_col_px": float(common[1]),
         "patient_mm": [float(value) for value in patient_mm],
         "snr": float(one.snr),
         "chi2_per_dof": float(one.chi2_per_dof),

@@ -346,6 +346,16 @@ def test_a_slice_that_was_held_up_while_the_clock_was_set_back_is_not_taken_for_
     assert "no slice arrived later than 3.0 s when this was measured: scan again" in unknown.text
 
 
+def test_pushes_that_are_all_equally_late_do_no_harm_beside_a_comparison():
+    """Alone they look like prompt ones of a clock that is off: see the premises in the docs."""
+    clock = compared(0.0)
+    for began_s in range(1010, 1100, 10):
+        late = Received(acquired(began_s), began_s + 22.0)
+        clock = observe(clock, late, MEASURED).clock
+    assert clock.bounds_for(late, MEASURED).low_s <= 0.0
+    assert clock._by_promptness(late, MEASURED).low_s == pytest.approx(17.0)
+
+
 def test_a_clock_set_forward_stops_everything_until_the_clocks_are_compared():
     clock = compared(0.0)
     ahead = Received(acquired(1160.0), 1103.0)

@@ -140,7 +140,7 @@ class BridgeRoom:
         if client.status.insertion_locked:
             client.set_insertion_lock(False, "test")
         truth_um = {axis: round(um) for axis, um in self.controllers.positions_um().items()}
-        client.declare_position(truth_um, "test")
+        client.declare_position(truth_um, "test", dict.fromkeys(truth_um, 1))  # measured
         client.set_phase(WorkPhase.MANUAL, "test")
         client.arm("test")
         if any(abs(um) > 5 for um in truth_um.values()):

@@ -1,7 +1,10 @@
 """A reference is believed on evidence alone: the truth is the stage's own position."""
 
+from collections.abc import Callable
+
 import pytest
 from pmd_rig import StageWithEnds, finish, opened, rig, wait_until
+from virtual_bench import POLL_S, Bench
 
 from robot_bridge.daemon.motors import MotorError
 from robot_bridge.emulator.axis import Motor
@@ -160,3 +163,108 @@ def test_home_needs_a_configured_place():
         pytest.raises(MotorError, match="home_mm"),
     ):
         motors.home()
+
+
+# --- in virtual time --------------------------------------------------------------------------
+
+
+def homing(motor: Motor | None = None, drive: str = "closed_loop", **changes: object) -> Bench:
+    return Bench(drive, names=("xt",), motor=motor, stage=StageWithEnds, declare=False, **changes)
+
+
+def home_until(made: Bench, at_um: float) -> None:
+    """The search, in the negative direction, has come there."""
+    made.motors.home(["xt"])
+    while made.truth_um() > at_um:
+        made.motors.poll()
+        made.line.wait(POLL_S)
+
+
+def run_until(made: Bench, wanted: Callable[[], bool]) -> None:
+    for _ in range(20_000):
+        if wanted():
+            return
+        made.motors.poll()
+        made.line.wait(POLL_S)
+    raise AssertionError("never")
+
+
+@pytest.mark.parametrize("drive", ["open_loop", "closed_loop"])
+@pytest.mark.parametrize("latency_s", [0.0, 0.03])
+def test_a_switch_that_trips_at_two_places_is_no_reference(drive: str, latency_s: float):
+    made = homing(SWITCHED, drive, latency_s=latency_s, **WIRED)
+    home_until(made, -3000)
+    made.board.faults.limit_reverse = True  # a loose wire
+    run_until(made, lambda: made.board.moving and not made.board.reverse)
+    made.board.faults.limit_reverse = False
+    run_until(made, lambda: made.board.moving and made.board.reverse)
+    from_um = made.truth_um()
+    run_until(made, lambda: made.truth_um() < from_um - 400)
+    made.board.faults.limit_reverse = True
+    status = made.finish()
+    assert status.fault == "cannot_home"
+    assert "away the second time" in status.fault_text
+    assert status.certain_axes == set()
+
+
+@pytest.mark.parametrize("drive", ["open_loop", "closed_loop"])
+@pytest.mark.parametrize("latency_s", [0.0, 0.03])
+def test_a_sound_switch_trips_at_one_place(drive: str, latency_s: float):
+    made = homing(SWITCHED, drive, latency_s=latency_s, **WIRED)
+    made.motors.home(["xt"])
+    status = made.finish()
+    assert status.fault is None, status
+    assert made.truth_um() == pytest.approx(status.readback_um["xt"], abs=100)
+
+
+@pytest.mark.parametrize(
+    ("drive", "wrong"),
+    [
+        ("open_loop", "limit_reverse"),
+        ("closed_loop", "limit_reverse"),
+        ("closed_loop", "encoder_frozen"),
+    ],
+)
+def test_pulling_off_at_the_end_is_checked(drive: str, wrong: str):
+    made = homing(SWITCHED, drive, **WIRED)
+    home_until(made, -19_990)
+    run_until(made, lambda: made.truth_um() > -19_100)
+    run_until(made, lambda: made.truth_um() < -19_995)
+    run_until(made, lambda: made.board.moving and not made.board.reverse)
+    setattr(made.board.faults, wrong, True)
+    status = made.finish()
+    assert status.fault == "cannot_home"
+    assert status.certain_axes == set()
+    made.motors.stop()
+    assert made.restart().certain_axes == set()
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.016])
+def test_a_hard_stop_is_not_ground_against(latency_s: float):
+    made = homing(latency_s=latency_s)
+    made.motors.home(["xt"])
+    status = made.finish()
+    assert status.certain
+    assert made.board.physics.ground_um < 2 * 1000  # two encounters; it was 3 mm
+
+
+@pytest.mark.parametrize("to", ["switch", "index"])
+def test_a_reference_that_does_not_come_ends_at_the_hard_stop_at_once(to: str):
+    """Dead switches, or an index that is not there: the encoder tells."""
+    changes = WIRED if to == "switch" else {"home_to": "index"}
+    made = homing(SWITCHED, **changes)
+    made.board.faults.limits_dead = True
+    made.motors.home(["xt"])
+    status = made.finish()
+    assert status.fault == "cannot_home"
+    assert made.board.physics.ground_um < 2 * 500
+
+
+@pytest.mark.parametrize("to", ["end", "switch", "index"])
+def test_a_motor_whose_encoder_is_dead_is_not_run_far(to: str):
+    changes = {"switch": WIRED, "index": {"home_to": "index"}, "end": {}}[to]
+    made = homing(SWITCHED, **changes)
+    made.board.faults.encoder_frozen = True
+    made.motors.home(["xt"])
+    assert made.finish().fault == "cannot_home"
+    assert abs(made.truth_um()) < 1500

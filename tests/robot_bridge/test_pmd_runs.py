@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from virtual_bench import NAMES, Bench
 
+from robot_bridge.emulator.axis import Motor
 from robot_bridge.pmd.protocol import MICROSTEPS_PER_STEP
 from robot_bridge.pmd.runs import Pace, Run
 
@@ -64,6 +65,70 @@ def test_an_encoder_that_died_just_before_a_stop_is_within_what_is_said(latency_
     off_um = abs(bench.truth_um("xt") - status.readback_um["xt"])
     assert off_um > 100
     assert "xt" not in status.certain_axes or off_um <= status.within_um["xt"]
+
+
+@pytest.mark.parametrize("fault", ["encoder_frozen", "stalled"])
+@pytest.mark.parametrize("latency_s", [0.0, 0.03])
+@pytest.mark.parametrize("way_um", [600, 9000])
+def test_after_a_stall_an_axis_may_be_anywhere_that_its_motor_can_have_gone(
+    fault: str, latency_s: float, way_um: int
+):
+    """A motor whose encoder is dead does not end at its target either."""
+    bench = Bench("closed_loop", latency_s, names=("xt",))
+    bench.move(-1000)
+    bench.move_until(-1000 + way_um, -900)
+    setattr(bench.board.faults, fault, True)
+    status = bench.finish()
+    assert status.fault == "stalled"
+    assert status.within_um["xt"] >= way_um
+    assert abs(bench.truth_um() - status.readback_um["xt"]) <= status.within_um["xt"]
+
+
+@pytest.mark.parametrize("wrong", [{"encoder_reversed": True}, {"um_per_count": 0.01}])
+@pytest.mark.parametrize("stopped", [True, False])
+def test_an_encoder_that_is_refuted_leaves_the_axis_within_what_is_said(wrong: dict, stopped: bool):
+    bench = Bench("closed_loop", names=("xt",), motor=Motor(**wrong))
+    bench.move_until(5000, 120)
+    if stopped:
+        bench.motors.stop()
+    status = bench.finish()
+    assert status.certain_axes == set()
+    assert abs(bench.truth_um() - status.readback_um["xt"]) <= status.within_um["xt"]
+
+
+@pytest.mark.parametrize("travel", [(-50, 20_000), (-20_000, 50), (-150, 250)])
+@pytest.mark.parametrize("towards", [1, -1])
+def test_the_proof_of_an_encoder_stays_inside_of_the_travel(travel: tuple, towards: int):
+    low, high = travel
+    bench = Bench("closed_loop", names=("xt",), travel_min_um=low, travel_max_um=high)
+    way_um = []
+    drive = bench.board.physics.drive
+
+    def seen(microsteps: int, frequency_hz: float) -> None:
+        drive(microsteps, frequency_hz)
+        way_um.append(bench.truth_um())
+
+    bench.board.physics.drive = seen
+    assert bench.move(45 * towards).reached
+    assert low <= min(way_um)
+    assert max(way_um) <= high
+
+
+def test_an_encoder_that_no_run_inside_of_the_travel_can_prove_is_not_believed():
+    bench = Bench("closed_loop", names=("xt",), travel_min_um=-20, travel_max_um=20,
+        counts_per_mm=200.0, motor=Motor(um_per_count=5.0), tolerance_um=15)  # fmt: skip
+    status = bench.move(20)
+    assert status.fault == "encoder_unproven"
+    assert bench.truth_um() == 0
+    assert "no room" in status.fault_text
+
+
+def test_a_coarse_encoder_is_proven_over_a_longer_run():
+    reversed_one = Motor(um_per_count=25.0, encoder_reversed=True)
+    bench = Bench("closed_loop", names=("xt",), motor=reversed_one, counts_per_mm=40.0,
+        tolerance_um=100)  # fmt: skip
+    assert bench.move(5000).fault == "encoder_disagrees"
+    assert abs(bench.truth_um()) < 1000
 
 
 def run_of(microsteps: int, sent_s: float, begun_by_s: float, polls: list[tuple]) -> Run:

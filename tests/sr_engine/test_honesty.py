@@ -102,3 +102,35 @@ def test_the_disc_fit_of_an_oval_says_what_its_mask_may_have_done(ratio: float) 
         error = found.centre_px - centre
         sigmas.append(np.sqrt(error @ np.linalg.solve(found.covariance_px2, error)))
     assert np.max(sigmas) < 4
+
+
+def test_what_draws_a_disc_in_all_frames_alike_is_apart_and_does_not_average_out() -> None:
+    """A spot at one side draws the centre of one frame as that of eight: only the noise shrinks."""
+    rng = np.random.default_rng(8)
+    centre = np.array((50.2, 61.9))
+    shifts = rng.uniform(-0.5, 0.5, (8, 2))
+    frames = []
+    for place in centre + shifts:
+        spot = render_disc((100, 124), tuple(place + np.array((0, 2.5))), 1.5)
+        clean = render_disc((100, 124), tuple(place), 5.0) + 0.2 * spot
+        noise = rng.normal(0, 1 / 60, (2, *clean.shape))
+        frames.append(np.hypot(clean + noise[0], noise[1]))
+    one = localize(frames[0], start_px=centre + shifts[0], radius_px=(2.5, 6.5), robust=False)
+    eight = localize(frames, shifts, start_px=centre, radius_px=(2.5, 6.5), robust=False)
+    assert one.systematic_px is not None
+    assert eight.systematic_px == pytest.approx(one.systematic_px, rel=0.3)
+    noise_px = np.sqrt(np.diag(eight.covariance_px2))
+    assert np.all(noise_px < 0.5 * np.sqrt(np.diag(one.covariance_px2)))
+    bias = float(eight.centre_px[1] - centre[1])
+    assert 1.5 * noise_px[1] < abs(bias) < 2 * eight.sigma_px[1]
+    assert eight.sigma_px == pytest.approx(np.hypot(noise_px, eight.systematic_px))
+
+
+def test_the_oval_is_not_taken_for_lopsided() -> None:
+    frame = oval(np.array((50.3, 62.4)), 5.0, 1.06, 0.7)
+    rng = np.random.default_rng(2)
+    noise = rng.normal(0, 1 / 60, (2, *frame.shape))
+    found = localize(
+        np.hypot(frame + noise[0], noise[1]), start_px=(50, 62), radius_px=(2.5, 6.5), robust=False
+    )
+    assert np.all(found.systematic_px < 0.03)
