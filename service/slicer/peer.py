@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import structlog
 
 from service.room.proposals import OPENIGTLINK, Plan, Verdict
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 from service.room.state import RoomState
 from service.slicer.allowance import Allowances
 from service.slicer.answers import (

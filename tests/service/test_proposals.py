@@ -13,7 +13,7 @@ from case_record.cases import Cases
 from dicom_listener.belonging import ACCEPTED, BOUND, event_body
 from dicom_slice.patient import Identity
 from service.room.proposals import MOST_OF_ONE, OPENIGTLINK, Plan
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 from service.slicer.server import OpenIgtLinkServer, bind_openigtlink
 
 INWARDS = "[openigtlink]\nport = 0\ninwards = true\n"

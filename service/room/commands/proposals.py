@@ -36,7 +36,7 @@ from service.room.proposals import (
     with_other_half,
 )
 from service.room.reach import OutOfReachError, ReachUnknownError, check_reach, entry_of
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 
 log = structlog.get_logger()
 TURNED_AWAY = "proposal_turned_away"
