@@ -60,6 +60,12 @@ def contracts() -> dict[str, list[str]]:
     }
 
 
+def test_no_two_files_of_the_tests_have_one_name():
+    """They are imported by name alone: of two, whichever comes first would serve both."""
+    names = Counter(path.name for path in (ROOT / "tests").rglob("*.py"))
+    assert [n for n, count in names.items() if count > 1 and n != "conftest.py"] == []
+
+
 def test_the_architecture_page_names_the_floors_that_import_linter_keeps():
     page = (ROOT / "docs" / "architecture.md").read_text()
     house = re.findall(r"^\| (\d) \| `(\w+)` \|", page, re.M)

@@ -2,7 +2,7 @@
 
 import pytest
 from axis_model import AXES
-from virtual_bench import Bench
+from pmd_bench import Bench
 from virtual_room import VirtualRoom
 
 from robot_bridge.daemon.motors import MotorError

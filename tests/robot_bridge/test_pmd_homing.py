@@ -3,8 +3,8 @@
 from collections.abc import Callable
 
 import pytest
+from pmd_bench import POLL_S, Bench
 from pmd_rig import StageWithEnds, finish, opened, rig, wait_until
-from virtual_bench import POLL_S, Bench
 
 from robot_bridge.daemon.motors import MotorError
 from robot_bridge.emulator.axis import Motor

@@ -3,7 +3,7 @@
 import re
 
 import pytest
-from virtual_bench import Bench
+from pmd_bench import Bench
 
 from robot_bridge.daemon.motors import MotorError
 from robot_bridge.emulator.commands import Answer

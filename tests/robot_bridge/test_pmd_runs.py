@@ -5,7 +5,7 @@ import math
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from virtual_bench import NAMES, Bench
+from pmd_bench import NAMES, Bench
 
 from robot_bridge.emulator.axis import Motor
 from robot_bridge.pmd.protocol import MICROSTEPS_PER_STEP
