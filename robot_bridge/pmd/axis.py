@@ -47,6 +47,7 @@ class PmdAxis(PmdRunner):
         try:
             yield from self.read_position_surely()
             yield from self.read_status()  # a count that a reset has put to zero is no place
+            yield from self.look_for_index()
         except PmdError:
             self.lose_position()
             self.unread = False

@@ -96,6 +96,7 @@ class PmdController:
         self.settings: dict[int, int] = {}  # Y numbers as they were set and read back
         self.tells_index = False
         self.seeks_index = False  # homing has armed it
+        self._index_passed = False  # or perhaps: an answer was not heard
         self.index_trapped = False  # it may have reset the count, or stopped the motor
         # One wrong bit makes `T0` (go to zero) of `U0`, but a harmless question of a bare `U`.
         self.status_body = "U"
@@ -196,7 +197,7 @@ class PmdController:
             self.status |= Status.RESET  # the answer that told it was lost
         passed = self.status & Status.INDEX or (self.tells_index and (reply.retried or unheard))
         if passed and self.closed_loop and not (self.seeks_index or self.needs_setup):
-            yield from self._look_for_index()
+            self._index_passed = True  # asked about when there is time: not while stopping
         self._asked_in_vain = False
         if self.status & Status.RESET:
             self.needs_setup = True
@@ -215,10 +216,12 @@ class PmdController:
         if not self.believes_mark and self.mark == DECLARED_MARK:
             yield from self.set_mark(INITIALISED_MARK)
 
-    def _look_for_index(self) -> Steps[None]:
+    def look_for_index(self) -> Steps[None]:
         """Somebody may have armed it; then passing it has reset the count, or stopped the motor."""
-        self.index_trapped = True
+        if not self._index_passed:
+            return
         mode = (yield from self.ask("N")).integer() if self.tells_index else None
+        self._index_passed = False
         self.index_trapped = mode != INDEX_OFF
         if self.index_trapped:
             self.needs_setup = True
@@ -263,6 +266,7 @@ class PmdController:
 
     def check_status(self) -> Steps[None]:
         """Raise AxisFaultError for whatever the status says is wrong."""
+        yield from self.look_for_index()
         status = self.status
         if status & Status.RESET or (self.parked and self.expected_parked is False):
             self.certain = False

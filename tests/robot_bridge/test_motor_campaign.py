@@ -8,6 +8,7 @@ beyond its travel, and what is called certain is where it is said to be.
 import os
 import random
 from collections import Counter
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -37,21 +38,26 @@ from robot_bridge.protocol.messages import (
     Status,
 )
 
-TRAVEL_UM = 20_000
+TRAVELS_UM = ((-20_000, 20_000), (-3000, 12_000), (0, 30_000), (-8000, 700), (500, 4500))
+STOP_UM = 1000  # how far outside of the travel the hard stops stand
+WRONG_SCALES = (0.3, 0.5, 0.55, 1.8, 2.0, 4.0)
 TOLERANCE_UM = 20
 NAMES = ("xt", "yt", "xb", "yb")
 KINDS = (
     "power", "flash", "plug", "swap", "stuck", "encoder", "stall", "stop", "garble", "drop",
 )  # fmt: skip
 # What a stage may go on while its encoder has just died: the time in which that is found.
-BLIND_UM = 1000.0  # at most to the hard stops, which stand that far outside of the travel
+BLIND_UM = float(STOP_UM)  # at most to the hard stops
 
 
 class ScatteringStage(StageWithEnds):
     """Steps that are as wrong as they may be, by direction, and differ from run to run."""
 
-    def __init__(self, rng: random.Random, step_error: float) -> None:
-        super().__init__()
+    def __init__(
+        self, rng: random.Random, step_error: float, travel_um: tuple[int, int], at_um: float
+    ) -> None:
+        super().__init__(position_um=at_um)
+        self.ends_um = (travel_um[0] - STOP_UM, travel_um[1] + STOP_UM)
         self._rng = rng
         self._nominal_um = 4.5
         self._by_direction = {d: 1 + rng.uniform(-step_error, step_error) for d in (1, -1)}
@@ -78,6 +84,11 @@ class Campaign:
         self.drive = rng.choice(("open_loop", "closed_loop"))
         self.latency_s = rng.choice((0.0, 0.0, 0.004, 0.016, 0.030))
         self.blind = False
+        self.travel_um = rng.choice(TRAVELS_UM)
+        self.to_index = self.drive == "closed_loop" and rng.random() < 0.5
+        low_um, high_um = self.travel_um
+        self.index_um = rng.uniform(low_um + 0.1 * (high_um - low_um), high_um)
+        self.home_um = round(self.index_um) if self.to_index else low_um
         self.tally: Counter[str] = Counter()
         switches = Switches()
         self.boards = [self._board(number, switches) for number in range(self.count)]
@@ -112,11 +123,15 @@ class Campaign:
     def _board(self, number: int, switches: Switches) -> EmulatedController:
         wrong: dict[str, object] = {}
         if self.rng.random() < 0.15:
-            wrong = self.rng.choice(
-                ({"encoder_reversed": True}, {"um_per_count": 0.05}, {"um_per_count": 0.2})
-            )
-        motor = Motor(serial_number=4010001 + number, switches_um=(-TRAVEL_UM, TRAVEL_UM), **wrong)
-        stage = ScatteringStage(random.Random(self.rng.random()), 0.04)
+            scales = [{"um_per_count": 0.1 / scale} for scale in WRONG_SCALES]
+            wrong = self.rng.choice([{"encoder_reversed": True}, *scales])
+        motor = Motor(
+            serial_number=4010001 + number, switches_um=self.travel_um, index_um=self.index_um,
+            **wrong,
+        )  # fmt: skip
+        stage = ScatteringStage(
+            random.Random(self.rng.random()), 0.04, self.travel_um, sum(self.travel_um) / 2
+        )
         address = 1 if self.own_ports else number + 1
         return EmulatedController(address, stage, motor, switches, self.line.now_s)
 
@@ -130,7 +145,9 @@ class Campaign:
     def _axis(self, number: int) -> AxisConfig:
         return axis_config(
             NAMES[number], f"port{number if self.own_ports else 0}", self.boards[number].address,
-            self.drive, approach_um=self.rng.choice((0, 50)), home_um=-TRAVEL_UM,
+            self.drive, approach_um=self.rng.choice((0, 50)), home_um=self.home_um,
+            travel_min_um=self.travel_um[0], travel_max_um=self.travel_um[1],
+            home_to="index" if self.to_index else "end",
             limit_switches=self.rng.choice((None, 1)), serial_number=4010001 + number,
         )  # fmt: skip
 
@@ -183,12 +200,15 @@ class Campaign:
         }
 
     def check_always(self) -> None:
-        limit_um = TRAVEL_UM + TOLERANCE_UM + (BLIND_UM if self.blind else 0.0)
+        spare_um = TOLERANCE_UM + (BLIND_UM if self.blind else 0.0)
+        low_um, high_um = self.travel_um
         for name, at_um in self.truth_um().items():
             told_um = at_um - self.offset_um[name]
-            if name in self.at_an_end and abs(told_um) > TRAVEL_UM:
+            if name in self.at_an_end:
                 continue
-            assert abs(told_um) <= limit_um, f"{name} at {told_um:.0f} um, {self}"
+            assert low_um - spare_um <= told_um <= high_um + spare_um, (
+                f"{name} at {told_um:.0f} um, {self}"
+            )
 
     def check_certain(self) -> None:
         self.run(0.3)  # a readback is as old as the last poll
@@ -215,7 +235,8 @@ class Campaign:
     def __str__(self) -> str:
         return (
             f"seed {self.seed}, {self.count} axes, {self.drive}, own ports {self.own_ports}, "
-            f"latency {self.latency_s}, {[b.motor for b in self.boards]}, tally {dict(self.tally)}"
+            f"latency {self.latency_s}, travel {self.travel_um}, "
+            f"{[b.motor for b in self.boards]}, tally {dict(self.tally)}"
         )
 
     # --- what happens -------------------------------------------------------------------------
@@ -228,7 +249,7 @@ class Campaign:
             if name in status.certain_axes and not loose:
                 continue
             measured_um = round(at_um - self.offset_um[name] + self.rng.uniform(-20, 20))
-            inside_um = min(max(measured_um, -TRAVEL_UM), TRAVEL_UM)
+            inside_um = min(max(measured_um, self.travel_um[0]), self.travel_um[1])
             if abs(inside_um - measured_um) <= TOLERANCE_UM:
                 self.ask(DeclarePosition({name: measured_um}, "t", self.now_ms, {name: 25}))
 
@@ -244,18 +265,28 @@ class Campaign:
             # what homing found is, by definition, where the coordinates begin
             told_um = self.bridge.status().positions_um[name]
             at_um = self.truth_um()[name]
-            assert at_um < -TRAVEL_UM + 700, f"homed in mid travel at {at_um:.0f} um, {self}"
+            wanted_um = self.index_um if self.to_index else self.travel_um[0]
+            off_um = at_um - told_um - (wanted_um - self.home_um)
+            within_um = TOLERANCE_UM if self.to_index else STOP_UM + 200
+            assert abs(off_um) < within_um, f"homed {off_um:+.0f} um off, {self}"
             self.offset_um[name] = at_um - told_um
             self.at_an_end.discard(name)
 
     def move(self) -> None:
+        self.at_an_end -= {
+            name
+            for name, at_um in self.truth_um().items()
+            if self.travel_um[0] <= at_um - self.offset_um[name] <= self.travel_um[1]
+        }
         status = self.bridge.status()
         setpoints_um = dict(status.positions_um)
         asked = self.rng.sample(self.names, self.rng.randint(1, self.count))
         for name in asked:
             way_um = self.rng.choice((150, 800, 3000, 9000)) * self.rng.uniform(0.5, 1.0)
             target_um = setpoints_um[name] + self.rng.choice((-1, 1)) * way_um
-            setpoints_um[name] = round(min(max(target_um, -19_500), 19_500))
+            setpoints_um[name] = round(
+                min(max(target_um, self.travel_um[0] + 500), self.travel_um[1] - 500)
+            )
         before_um = self.truth_um()
         self.moves += 1
         number = self.moves
@@ -335,8 +366,7 @@ class Campaign:
         """An engineer has read why nothing gets anywhere, and rewires what is wrong."""
         self.run(0.3)
         for board in self.boards:
-            serial_number, ends = board.motor.serial_number, board.motor.switches_um
-            board.motor = Motor(serial_number=serial_number, switches_um=ends)
+            board.motor = replace(board.motor, um_per_count=0.1, encoder_reversed=False)
             board.power_on(self.line.now_s)
         self.tally["mended"] += 1
 

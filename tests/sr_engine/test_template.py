@@ -85,6 +85,20 @@ def test_of_two_alike_the_one_that_moves_is_learnt(places: np.ndarray) -> None:
     assert np.hypot(*(fit.centre_px - places[0])) < 0.1
 
 
+def test_a_region_finds_what_the_whole_frame_does_and_none_lies_outside(places: np.ndarray) -> None:
+    template = learnt(places)
+    frame = frames_at(places[:1], np.random.default_rng(5))[0]
+    everywhere = template.fit(frame)
+    row, col = np.rint(everywhere.centre_px).astype(int)
+    for region in ((row - 4, col - 6, row + 7, col + 5), (-9, -9, row + 3, 10**6)):
+        assert template.fit(frame, region=region).centre_px == pytest.approx(
+            everywhere.centre_px, abs=1e-6
+        )
+    for region in ((10**4, 0, 10**4 + 9, 9), (-30, 0, -20, 9), (9, 9, 9, 9)):
+        with pytest.raises(NoRoundObjectError, match="outside of the frame"):
+            template.fit(frame, region=region)
+
+
 def test_one_frame_and_two_are_too_few(places: np.ndarray) -> None:
     frames = frames_at(places[:2], np.random.default_rng(5))
     for count in (1, 2):
