@@ -29,7 +29,7 @@ class Holds(Connection):
     ) -> Hold:
         """The robot stands settled from `settled_at_s` on. There is at most one open hold.
 
-        bridge: how the robot's bridge stood then, see `service.room.present`.
+        bridge: how the robot's bridge stood then, see `service.room.validity`.
         """
         with self.transaction():
             cursor = self._db.execute(

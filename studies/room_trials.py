@@ -25,7 +25,7 @@ from service.client import RefusedByServiceError, RoomClient, ServiceGoneError
 from service.procedure.strategies import STRATEGIES
 from service.room.belief.state import BeliefState, GoalBelief
 from service.room.state import RoomState
-from service.web.schemas import EventBody
+from service.web.schemas import LONGEST_JOG_UM, EventBody
 from studies.navigation import RANDOM_POINT_MM, Group, GroupResult, Puncture
 from studies.navigation_study import NavigationStudy
 
@@ -276,9 +276,12 @@ class RoomTrials:
         for axis in sorted(calibration.per_axis):
             low, high = state.robot.travel_um[axis]
             point_um = 1000 * rng.uniform(-RANDOM_POINT_MM, RANDOM_POINT_MM)
-            distance_um = round(min(max(point_um, low), high)) - state.robot.positions_um[axis]
-            if distance_um:
-                self._procedure(partial(self._client.jog, axis, distance_um))
+            goal_um = round(min(max(point_um, low), high))
+            away_um = goal_um - state.robot.positions_um[axis]
+            while away_um:
+                jog_um = min(max(away_um, -LONGEST_JOG_UM), LONGEST_JOG_UM)
+                self._procedure(partial(self._client.jog, axis, jog_um))
+                away_um -= jog_um
 
     def _minutes(self, procedure_id: int) -> float:
         """From the start of an approach to its end, by the events of the room."""

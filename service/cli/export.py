@@ -10,6 +10,7 @@ import hashlib
 import io
 import json
 import os
+import sqlite3
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict
@@ -58,26 +59,36 @@ def export(
     target = out or Path(f"{case.resolve().name}.{'mrb' if slicer else 'zip'}")
     if target.exists() and not force:
         raise ExportError(f"{target} already exists (--force overwrites it)")
-    with CaseRecord(case, read_only=True) as record:
-        members = (_write_scene if slicer else write_export)(record, target)
+    try:
+        with CaseRecord(case, read_only=True) as record:
+            members = (_write_scene if slicer else write_export)(record, target)
+    except ExportError:
+        raise
+    except (sqlite3.Error, KeyError, TypeError, ValueError) as error:
+        # damaged pages of the database, or what stands in them
+        what = f"{type(error).__name__}: {error}"
+        raise ExportError(
+            f"{case}: the case record is damaged ({what}): restore it from its backup"
+        ) from error
     print(f"{target}: {members} files")
 
 
 def _write_scene(record: CaseRecord, target: Path) -> int:
     """As `write_export`, for 3D Slicer."""
-    from service.cli.slicer_scene import write_scene
+    from service.cli.slicer_scene import scene_members, write_scene
 
     if record.case() is None:
         raise ExportError(f"{record.case_dir}: no case here")
     fresh = target.with_name(target.name + ".part")
+    members = list(scene_members(record))
     try:
-        members = write_scene(record, fresh, target.stem)
+        write_scene(members, fresh, target.stem)
         os.replace(fresh, target)
     except OSError as error:
         raise ExportError(f"{target}: cannot be written ({error.strerror})") from error
     finally:
         fresh.unlink(missing_ok=True)
-    return members + 1
+    return len(members) + 1
 
 
 def write_export(record: CaseRecord, target: Path) -> int:

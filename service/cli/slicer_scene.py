@@ -75,17 +75,12 @@ class Member:
     content: bytes
 
 
-def write_scene(record: CaseRecord, target: Path, home: str) -> int:
-    """Write the scene's zip; return how many files it holds beside the scene itself.
-
-    home: name of the scene, and of the folder in the zip.
-    """
-    members = list(scene_members(record))
+def write_scene(members: list[Member], target: Path, home: str) -> None:
+    """Write the scene's zip. home: name of the scene, and of the folder in the zip."""
     with zipfile.ZipFile(target, "w", zipfile.ZIP_DEFLATED) as archive:
         for member in members:
             _put(archive, f"{home}/{_FOLDER}/{member.name}", member.content)
         _put(archive, f"{home}/{home}.mrml", mrml(members))
-    return len(members)
 
 
 def _put(archive: zipfile.ZipFile, name: str, content: bytes) -> None:

@@ -19,7 +19,7 @@ from service.procedure.plane import ImagePlane
 from service.procedure.registry import APPROACHES, GUIDE_APPROACH
 from service.procedure.targets import ENTRY_SET, TARGET_SET, TARGET_WITHDRAWN
 from service.room.history import targets_over_time
-from service.room.present import READY
+from service.room.validity import READY
 from sr_engine.request import geometry_of
 
 

@@ -38,6 +38,7 @@ class Strategy:
 
 _ML, _BASE = Imaging("ml"), Imaging("base")
 _BICUBIC, _SR = Imaging("bicubic", factor=2), Imaging("sr", shifted=True, factor=2)
+# a name stands in room_config.service.Strategy as well: a room's file is read without this package
 STRATEGIES: Mapping[str, Strategy] = MappingProxyType(
     {
         "base": Strategy(_BASE, _BASE),

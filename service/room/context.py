@@ -21,9 +21,9 @@ from service.room.belief.goal import effective
 from service.room.execution import Execution
 from service.room.link import RoomLink
 from service.room.motion_allowed import may_start
-from service.room.present import RESTS_ON, Now
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 from service.room.stop_latch import StopLatch
+from service.room.validity import RESTS_ON, Now
 
 SOURCE = "service"
 

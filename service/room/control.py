@@ -43,13 +43,13 @@ from service.room.counts.correct import correct_counts
 from service.room.execution import Execution, ProcedureAbortedError
 from service.room.integrity import doubt_of, doubt_of_arrival
 from service.room.link import RoomLink
-from service.room.present import Now
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 from service.room.scanner_clock import ClockWatch, note_step
 from service.room.state import RoomState
 from service.room.state_view import Describer, ProcessLook, describe_robot
 from service.room.stop_latch import StopLatch
 from service.room.trouble import RECORD_FAULTS, Trouble, held
+from service.room.validity import Now
 
 _TICK_S = 0.01
 _HOLD_TICK_S = 0.02

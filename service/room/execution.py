@@ -32,8 +32,8 @@ from service.procedure.steps import (
 from service.room.going_on import GO_ON, Permitted
 from service.room.link import RoomLink
 from service.room.measuring import measure_request, measured_from_result
-from service.room.present import RESTS_ON, bridge_facts, rests_on, why_stood_no_more
 from service.room.scanner_clock import clock_margin_s, is_by_another_clock
+from service.room.validity import RESTS_ON, bridge_facts, rests_on, why_stood_no_more
 from sr_engine.request import is_at_position
 
 _SERVICE = "service"

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from case_record.record import CaseRecord
-from service.room.present import Now, Readiness, needle_may_be_in
-from service.room.readiness import ConflictError, ready_arrival
+from service.room.refusal import ConflictError
+from service.room.validity import Now, Readiness, needle_may_be_in, ready_arrival
 
 
 def may_start(record: CaseRecord, now: Now) -> ConflictError | None:

@@ -12,7 +12,7 @@ from service.procedure.registry import latest_calibration
 from service.procedure.targets import current_entry, current_target, why_void_target
 from service.room.execution import Execution
 from service.room.link import RoomLink
-from service.room.present import Readiness
+from service.room.validity import Readiness
 
 
 def prompt(

@@ -25,6 +25,7 @@ OPENIGTLINK = "OpenIGTLink"
 MOST_SENDERS, MOST_OF_ONE = 8, 4
 _MOST_SHOWN = 24
 _BORE_MM = 500.0
+_NOT_TURNED = 1.0 - 1e-4
 
 Point3 = tuple[float, float, float]
 
@@ -134,6 +135,18 @@ def why_senseless(plan: Plan) -> str:
     if plan.target_mm is not None and plan.target_mm == plan.entry_mm:
         return "its entry point and target are the same point, which gives no direction"
     return ""
+
+
+def why_no_direction(plan: Plan, *, guide: bool) -> str:
+    """Why its direction of the needle cannot be heeded; empty where it can, or has none. A matrix
+    that is not turned (the patient's axes) states none to a room that cannot set one.
+    """
+    if guide or plan.direction is None or plan.direction[2] > _NOT_TURNED:
+        return ""
+    return (
+        "it gives a direction of the needle, which this robot cannot set (it has no needle guide): "
+        "send the target with a matrix that is not turned, or as a POINT labelled TARGET"
+    )
 
 
 def why_not_in_bore(plan: Plan) -> str:

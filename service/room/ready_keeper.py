@@ -5,7 +5,7 @@ from __future__ import annotations
 from robot_bridge.client.client import BridgeError
 from service.room.context import SOURCE, RoomContext
 from service.room.motion_allowed import lock_wanted
-from service.room.present import (
+from service.room.validity import (
     READY,
     READY_LOST,
     Readiness,

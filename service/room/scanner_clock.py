@@ -18,8 +18,8 @@ from dicom_listener.clock import ClockRules
 from dicom_listener.scanner_clocks import CLOCK_COMPARED, CLOCK_DOUBTED, CLOCK_FORGOTTEN
 from room_config.load import Config
 from service.room.alarms import Condition
-from service.room.present import computer_start
 from service.room.state import ClockState
+from service.room.validity import computer_start
 
 # by less the margins between a hold and its slices allow for
 _STEP_S = 0.1

@@ -36,7 +36,6 @@ from service.room.measurement_view import (
     describe_reconstruction,
 )
 from service.room.motion_allowed import may_start
-from service.room.present import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
 from service.room.prompt import is_calibrated, is_punctured, next_action, outcome_text, prompt
 from service.room.proposals import ProposalBook
 from service.room.robot.whereabouts import source_of, taken_to_stand
@@ -56,6 +55,7 @@ from service.room.state import (
     RoomState,
     SliceState,
 )
+from service.room.validity import RESTS_ON, Now, Readiness, age_s, readiness, why_not_now
 
 PROCESSES = ("listener", "worker")
 _BEAT_IS_OLD_S = 1.0

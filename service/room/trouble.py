@@ -14,7 +14,7 @@ from typing import Any
 
 from case_record.record import CaseRecord
 from service.room.alarms import Condition
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 from service.room.state import AlarmState, LostState, MeasurementState, RobotState, RoomState
 
 RECORD_FAULTS = (sqlite3.Error, OSError)

@@ -15,7 +15,7 @@ from typing import Any, Protocol
 import structlog
 
 from service.room.proposals import OPENIGTLINK, Plan, Verdict
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 from service.room.state import RoomState
 from service.slicer.allowance import Allowances
 from service.slicer.answers import (
@@ -171,6 +171,7 @@ class Peer:
         if version != self._version:
             self._version = version
             self._sent = {}  # what could not be said in the other version is said now
+            self._wake.set()
 
     def _put(self, message: Received) -> None:
         """What is not for the robot, a tracker's stream say, keeps nothing waiting."""
@@ -270,10 +271,12 @@ class Peer:
             self._wake.clear()
             while self._replies:
                 await self._write(self._replies.popleft())
-            for device, message in self._room.scene.items():
-                if _is_news(message, self._sent.get(device), self._version):
+            for device in list(self._room.scene):
+                # the newest of each: the scene may have changed while another was being written
+                message, sent = self._room.scene[device], self._sent
+                if _is_news(message, sent.get(device), self._version):
                     await self._write(message)
-                    self._sent[device] = message
+                    sent[device] = message  # forgotten if it turned to the other version meanwhile
                 while self._replies:
                     await self._write(self._replies.popleft())
 

@@ -12,8 +12,8 @@ from room_config.load import Config
 from service.procedure.arguments import gate_of, geometry_of
 from service.procedure.fiducials import GuideSeenWrongError, line_of_state
 from service.procedure.registry import latest_calibration
-from service.room.present import Now, why_not_carried, why_not_now
 from service.room.state import ArrivalState, RoomState
+from service.room.validity import Now, why_not_carried, why_not_now
 from service.slicer.messages import INVALID, TRANSFORM_STATUS, VALID, Message, transform
 from service.slicer.scene import axes_along, standing
 

@@ -131,7 +131,8 @@ class Images:
         if device in self._shown and self._shown[device][0] == key:
             return
         made = None if shown is None or record is None else _image(device, at_s, shown, record)
-        self._shown[device] = key, made or _no_image(device, at_s)
+        is_final = shown is None or record is not None  # else it is looked for again
+        self._shown[device] = key if is_final else ("", -1), made or _no_image(device, at_s)
 
 
 def _image(

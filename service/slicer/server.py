@@ -33,6 +33,7 @@ from service.slicer.scene import Images, Scene, scene_of, stale
 Found = TypeVar("Found")
 _LOOK_S = 0.05
 _STATUS_EVERY_S = 1.0
+_TRIES = 3
 
 log = structlog.get_logger("openigtlink")
 
@@ -129,19 +130,28 @@ class OpenIgtLinkServer:
             due = now_s() - told_s >= _STATUS_EVERY_S  # that the room lives
             if not self._peers or not (due or state.revision != revision):
                 continue
-            revision, told_s = state.revision, now_s()
-            scene = scene_of(state, self._config.service.guide)
-            more = await asyncio.to_thread(self._from_record, self._read, {})
-            self.scene = scene | more
+            told_s = now_s()
+            images = await asyncio.to_thread(self._from_record, self._images.of, {})
+            images = images or self._images.of(self.state, None)
+            state, pose = await self._state_and_pose()
+            revision = state.revision
+            place = {CURRENT_POSITION: pose_message(pose, state.at_s)}
+            self.scene = scene_of(state, self._config.service.guide) | place | images
             for peer in list(self._peers):
                 peer.look(state)
 
-    def _read(self, state: RoomState, record: CaseRecord | None) -> Scene:
-        pose = self._pose(state, record)
-        return {
-            CURRENT_POSITION: pose_message(pose, state.at_s),
-            **self._images.of(state, record),
-        }
+    async def _state_and_pose(self) -> tuple[RoomState, Pose | None]:
+        """Of one moment: a pose that was worked out while the room changed is not that of now.
+
+        What holds now is shown with it; where the room does not rest, no pose is known.
+        """
+        for _ in range(_TRIES):
+            before = self.state
+            pose = await asyncio.to_thread(self.pose)
+            now = self.state
+            if (now.revision, now.robot.linked) == (before.revision, before.robot.linked):
+                return now, pose
+        return self.state, None
 
     def _pose(self, state: RoomState, record: CaseRecord | None) -> Pose | None:
         return pose_of(state, record, self._config, self._loop.now)

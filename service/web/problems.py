@@ -22,7 +22,7 @@ from case_record.cases import CasesError, NoCaseError
 from case_record.record import CaseRecordError, RecordUnavailableError
 from case_record.seals import TamperedError
 from service.room.images import ImageMissingError
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 
 PROBLEM_TYPE = "application/problem+json"
 _CODES = {404: "not_found", 405: "method_not_allowed", 415: "unsupported_media_type"}

@@ -14,6 +14,9 @@ _WHO = (
 )
 
 
+LONGEST_JOG_UM = 5000
+
+
 class _Body(BaseModel):
     model_config = ConfigDict(extra="forbid", allow_inf_nan=False)
 
@@ -122,7 +125,9 @@ class StopAnswer(BaseModel):
 
 class JogBody(Ask):
     axis: str = Field(min_length=1, max_length=32, examples=["xt"])
-    distance_um: int = Field(ge=-5000, le=5000, examples=[100], description="At most 5 mm.")
+    distance_um: int = Field(
+        ge=-LONGEST_JOG_UM, le=LONGEST_JOG_UM, examples=[100], description="At most 5 mm."
+    )
 
 
 class CaseBody(Ask):

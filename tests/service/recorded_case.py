@@ -16,7 +16,7 @@ from dicom_slice.header import read_header
 from service.procedure.registry import APPROACH
 from service.procedure.steps import HoldShift
 from service.procedure.targets import TARGET_SET
-from service.room.present import READY
+from service.room.validity import READY
 from simulator.config import SliceProtocol, VirtualRoom
 from sr_engine.worker import measure
 

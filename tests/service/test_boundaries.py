@@ -8,6 +8,7 @@ import json
 import os
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -105,7 +106,10 @@ class Injected:
         for _ in range(20):
             try:
                 return order()
-            except (RefusedByServiceError, ServiceGoneError):
+            except (RefusedByServiceError, ServiceGoneError) as error:
+                if getattr(error, "code", "") == "not_armed":  # the link was lost since
+                    with suppress(RefusedByServiceError, ServiceGoneError):
+                        arm(self.client)
                 time.sleep(0.3)
         return None
 

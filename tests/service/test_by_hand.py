@@ -6,7 +6,7 @@ import pytest
 from line_room import patient_mm, running_line_room
 
 from service.cli.report import report_page
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 from service.web.routes.record import _offered
 
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from offline_arguments import GATE, calibration_arguments
 
+from room_config.service import STRATEGIES as CONFIGURABLE
 from service.procedure.calibration import calibrate
 from service.procedure.fiducials import ONE_FIDUCIAL
 from service.procedure.jacobian import CalibrationError
@@ -169,3 +170,7 @@ def test_a_robot_that_was_mounted_anew_may_be_turned_and_no_longer_than_before(m
     turned.check_is_of_same_robot(jacobian, 0.015, same_mount=False)
     with pytest.raises(CalibrationError, match="differs from the last calibration"):
         turned.check_is_of_same_robot(jacobian, 0.015, same_mount=True)
+
+
+def test_a_room_can_be_configured_with_every_strategy_and_with_no_other() -> None:
+    assert set(STRATEGIES) == set(CONFIGURABLE)

@@ -29,7 +29,7 @@ from service.procedure.registry import (
     calibration_arguments as calibration_json,
 )
 from service.procedure.steps import Acquire
-from service.room.present import Now, why_not_now
+from service.room.validity import Now, why_not_now
 from simulator.config import VirtualRoom
 from simulator.stage_physics import StageParameters
 from sr_engine.reconstruction.shiftset import named

@@ -15,7 +15,7 @@ from room_config.load import load_config
 from service.room.conditions import disk_refuses
 from service.room.control import STALE_S, ControlLoop
 from service.room.link import PumpedClient, RoomLink
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 from service.room.state import RoomState
 
 

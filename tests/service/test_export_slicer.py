@@ -1,9 +1,12 @@
 """`autospine export CASE --slicer`: every file by its format's own reader, against the record."""
 
 import json
+import shutil
+import sqlite3
 import subprocess
 import zipfile
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from xml.etree import ElementTree
 
@@ -11,7 +14,7 @@ import numpy as np
 import pytest
 from recorded_case import come_to_ready, make_case, puncture
 
-from case_record.record import CaseRecord
+from case_record.record import FILE_NAME, CaseRecord
 from dicom_slice.geometry import SliceGeometry
 from room_config.shell import autospine
 from service.cli.slicer_formats import itk_transform, nrrd
@@ -124,6 +127,26 @@ def test_a_file_that_is_there_is_not_replaced_and_a_folder_without_a_case_is_nam
     )
     assert none.returncode == 2
     assert "Traceback" not in none.stderr
+
+
+def test_a_record_that_is_damaged_inside_ends_with_one_line_that_says_what_to_do(scene, tmp_path):
+    _, record = scene
+    shutil.copytree(record.case_dir, tmp_path / "case")
+    database = tmp_path / "case" / FILE_NAME
+    with closing(sqlite3.connect(database)) as opened:
+        opened.execute("PRAGMA wal_checkpoint(TRUNCATE)")
+        (page_bytes,) = opened.execute("PRAGMA page_size").fetchone()
+        (root,) = opened.execute("SELECT rootpage FROM sqlite_master WHERE name = 'measurement'")
+    content = bytearray(database.read_bytes())
+    content[(root[0] - 1) * page_bytes : root[0] * page_bytes] = b"\xa5" * page_bytes
+    database.write_bytes(content)
+    words = autospine("export", str(tmp_path / "case"), "--slicer", "--out", str(tmp_path / "out"))
+    done = subprocess.run(words, capture_output=True, text=True)
+    (said,) = done.stderr.strip().splitlines()
+    assert done.returncode == 2
+    assert "the case record is damaged" in said
+    assert "restore it" in said
+    assert not list(tmp_path.glob("out*"))
 
 
 def test_oblique_slices_keep_their_place(tmp_path):

@@ -1,6 +1,9 @@
 """The table of what peers may say, against every state of the room: no I/O."""
 
+import asyncio
+import contextlib
 import struct
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -19,6 +22,7 @@ from service.slicer.answers import (
     verdict_of,
 )
 from service.slicer.messages import Message, Point, points, string, transform
+from service.slicer.peer import Peer
 from service.slicer.pose import Pose
 from service.slicer.reading import Received, Stream, matrix_of, stop_word, string_of
 
@@ -297,3 +301,29 @@ def test_the_sender_is_told_what_the_room_makes_of_a_plan():
     assert code_of(refused) == (5, 0)
     assert b"refused by Olga: vessel in the way" in refused.content
     assert code_of(decision_of(7, "taken", "Olga", "", 1.0)) == (1, 0)
+
+
+def test_what_was_sent_in_version_1_is_said_again_with_its_validity_in_version_2():
+    """Also if the peer says which version it reads while that very message is on its way."""
+
+    class Wire:
+        sent = b""
+
+        def write(self, data):
+            self.sent += data
+
+        async def drain(self):
+            peer._note_version(2)
+
+    async def send():
+        peer._wake.set()
+        with contextlib.suppress(TimeoutError):
+            await asyncio.wait_for(peer._send(), 0.2)
+
+    wire = Wire()
+    scene = {"CURRENT_POSITION": POSE.message("CURRENT_POSITION", 1.0)}
+    peer = Peer("10.0.0.7:5000", SimpleNamespace(scene=scene), None, wire)
+    asyncio.run(send())
+    first, again = Stream().feed(wire.sent)
+    assert (first.version, again.version) == (1, 2)
+    assert again.meta["TransformStatus"] == "OK"

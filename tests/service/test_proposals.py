@@ -3,6 +3,7 @@
 import asyncio
 import threading
 from contextlib import contextmanager
+from dataclasses import replace
 
 import pytest
 from line_room import patient_mm, running_line_room
@@ -12,7 +13,7 @@ from case_record.cases import Cases
 from dicom_listener.belonging import ACCEPTED, BOUND, event_body
 from dicom_slice.patient import Identity
 from service.room.proposals import MOST_OF_ONE, OPENIGTLINK, Plan
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 from service.slicer.server import OpenIgtLinkServer, bind_openigtlink
 
 INWARDS = "[openigtlink]\nport = 0\ninwards = true\n"
@@ -143,7 +144,7 @@ def test_a_target_and_an_entry_that_a_station_sends_apart_are_one_plan(tmp_path)
         def knows(state, number):
             return any(p.number == number for p in state.proposals)
 
-        first = propose(target_mm=TARGET, direction=(0.0, -1.0, 0.0))
+        first = propose(target_mm=TARGET, direction=(0.0, 0.0, 1.0))
         strangers = propose(other, name="E", entry_mm=ENTRY)
         assert strangers.target_mm is None
         both = propose(name="E", entry_mm=ENTRY)
@@ -156,6 +157,18 @@ def test_a_target_and_an_entry_that_a_station_sends_apart_are_one_plan(tmp_path)
         assert states[first.number] == states[both.number] == "joined"
         room.call("refuse_proposal", number=moved.number, why="no")
         assert propose(name="E", entry_mm=ENTRY).target_mm is None, "what was refused is over"
+
+
+def test_a_direction_in_a_room_without_a_needle_guide_is_refused_and_not_ignored(tmp_path):
+    with running_line_room(tmp_path) as room:
+        turned = sent_from("10.0.0.7:5000", target_mm=TARGET, direction=(0.0, -0.6, 0.8))
+        verdict = room.call("propose", plan=turned)
+        assert verdict.code == "invalid"
+        assert "no needle guide" in verdict.text
+        room.call("propose", plan=sent_from("10.0.0.7:5000", entry_mm=ENTRY))
+        assert room.call("propose", plan=turned).code == "invalid", "nor beside an entry point"
+        straight = replace(turned, direction=(0.0, 0.0, 1.0))
+        assert room.call("propose", plan=straight).code == "proposed"
 
 
 def test_a_half_from_before_the_table_moved_joins_no_other(tmp_path):
@@ -302,3 +315,33 @@ def test_both_halves_of_a_plan_are_answered_as_one(tmp_path):
         (one,) = [p for p in room.later().proposals if p.state == "open"]
         assert one.target_mm is not None
         assert one.entry_mm is not None
+
+
+def test_a_pose_is_shown_with_the_state_that_it_belongs_to(tmp_path):
+    """The robot moves while the pose is being worked out: what comes out is not where it is now."""
+
+    class Slow(OpenIgtLinkServer):
+        moved = False
+
+        def pose(self):
+            found = super().pose()
+            if not self.moved:
+                self.moved = True
+                revision = room.state.revision
+                room.call("jog", axis="xt", distance_um=500)
+                room.until(lambda s: s.revision > revision and s.procedure is None)
+                room.later()
+            return found
+
+    with running_line_room(tmp_path, INWARDS) as room:
+        room.calibrate()
+        listening = bind_openigtlink(room.config.openigtlink)
+        server = Slow(room.config, Cases(*room.config.room.folders), room.loop, listening)
+        listening.close()
+        before = OpenIgtLinkServer.pose(server)
+        state, pose = asyncio.run(server._state_and_pose())
+        assert state.revision == room.state.revision
+        now = server.pose()
+        assert now.origin_mm.tolist() != before.origin_mm.tolist()
+        assert pose.origin_mm.tolist() == now.origin_mm.tolist()
+        assert pose.measured == now.measured

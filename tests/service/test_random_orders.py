@@ -14,7 +14,7 @@ import pytest
 from line_room import ORIGIN_MM, LineRoom, patient_mm
 
 from case_record.record import CaseRecordError
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 
 ORDERS = 2000
 SOAK_SEEDS = range(100, 150)

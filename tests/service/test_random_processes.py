@@ -17,8 +17,8 @@ from attended_room import AttendedRoom, arm, read_off, running_room, wait_for
 
 from case_record.record import CaseRecord
 from service.client import RefusedByServiceError, RoomClient, ServiceGoneError
-from service.room.present import READY, READY_LOST
 from service.room.state import RoomState
+from service.room.validity import READY, READY_LOST
 from simulator.config import VirtualRoom
 from simulator.scene import true_fiducial_mm
 from simulator.truth_client import TruthAddress, ask_where

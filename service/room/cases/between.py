@@ -12,7 +12,7 @@ from room_config.load import Config
 from service.room.alarms import Condition
 from service.room.cases.held import HeldSlices
 from service.room.cases.life import begin, reopen
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 from service.room.state import AlarmState, ProcessState, RobotState, RoomState
 
 log = structlog.get_logger()

@@ -10,8 +10,8 @@ from dicom_listener.taking import TakingError, accept_frame, take_study
 from robot_bridge.client.client import BridgeError
 from service.room.cases.life import CONTINUED, FINISHED, CaseLife
 from service.room.context import RoomContext
-from service.room.present import needle_may_be_in
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
+from service.room.validity import needle_may_be_in
 
 WHILE_ASKING = frozenset({"note_stop", "continue_case", "finish_case", "needle_out"})
 

@@ -29,9 +29,9 @@ from service.procedure.targets import (
 )
 from service.room.context import RoomContext
 from service.room.history import arrival_by_hand
-from service.room.present import PUNCTURE, readiness
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 from service.room.robot.memory import last_jacobian
+from service.room.validity import PUNCTURE, readiness
 
 
 class ProcedureCommands:

@@ -27,6 +27,7 @@ from service.room.proposals import (
     ProposalState,
     Verdict,
     frame_of_reference,
+    why_no_direction,
     why_not_in_bore,
     why_other_frame,
     why_senseless,
@@ -35,7 +36,7 @@ from service.room.proposals import (
     with_other_half,
 )
 from service.room.reach import OutOfReachError, ReachUnknownError, check_reach, entry_of
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 
 log = structlog.get_logger()
 TURNED_AWAY = "proposal_turned_away"
@@ -119,11 +120,12 @@ class ProposalCommands:
         """
         self._withdraw_void()  # a half for where the table lay before joins no other
         known = self._book.update(self._room.record)
+        why = why_no_direction(plan, guide=self._room.config.service.guide is not None)
         plan = with_other_half(plan, known)
         mine = [one for one in known if one.state == "open" and _same(one, plan)]
-        if mine:
+        if mine and not why:
             return self._waiting(mine[0], reach_known=not mine[0].note)
-        verdict = self._judge(plan, known)
+        verdict = Verdict("invalid", why) if why else self._judge(plan, known)
         if verdict.code != "proposed":
             self._turn_away(plan, by, verdict.text, received)
             return verdict

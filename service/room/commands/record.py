@@ -7,7 +7,7 @@ import time
 from dicom_listener.operator_actions import give_up_slices, reassign, reset_clock, why_not_by_hand
 from dicom_listener.scanner_clocks import CLOCK_COMPARED
 from service.room.context import RoomContext
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 
 
 class RecordCommands:

@@ -10,9 +10,9 @@ from service.procedure.plan import PlanRefusedError, check_travel
 from service.procedure.registry import JOG
 from service.room.context import RoomContext
 from service.room.going_on import ARMED
-from service.room.present import NEEDLE_OUT
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 from service.room.robot.whereabouts import in_words, taken_to_stand
+from service.room.validity import NEEDLE_OUT
 
 
 class RobotCommands:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from room_config.service import STRATEGIES
 from service.room.belief.goal import SETTINGS_CHANGED, bounds_of
 from service.room.context import RoomContext
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 
 
 class SettingsCommands:

@@ -20,7 +20,7 @@ from service.procedure.targets import (
 from service.room.context import RoomContext
 from service.room.proposals import Plan, why_not_in_bore, why_senseless
 from service.room.reach import OutOfReachError, ReachUnknownError, check_reach
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
 from service.room.summaries import PointMm
 
 

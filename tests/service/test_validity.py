@@ -11,8 +11,8 @@ from service.dicom_out.content import finding_of_arrival
 from service.dicom_out.make import outputs_to_send
 from service.dicom_out.report import comment_of
 from service.room.context import now_of
-from service.room.present import Now, lost_since_ready, readiness, why_not_now
-from service.room.readiness import ConflictError
+from service.room.refusal import ConflictError
+from service.room.validity import Now, lost_since_ready, readiness, why_not_now
 from service.slicer.messages import STATUS_HEAD
 from service.slicer.pose import pose_of
 from service.slicer.scene import scene_of, standing

@@ -25,6 +25,7 @@ from case_record.rows import Event, Measurement
 from robot_bridge.client.client import BridgeStatus
 from service.procedure.initial_estimate import POSITION_DECLARED
 from service.procedure.plan import SAME_PLACE_UM
+from service.procedure.registry import APPROACHES
 from service.procedure.scan_frame import (
     CASE_REOPENED,
     ScanFrame,
@@ -34,7 +35,6 @@ from service.procedure.scan_frame import (
     seen_seq,
 )
 from service.procedure.targets import current_entry_number, current_target, why_void_target
-from service.room.readiness import ready_arrival
 
 READY, READY_LOST = "ready", "ready_lost"
 PUNCTURE, NEEDLE_OUT = "puncture", "needle_out"
@@ -167,6 +167,24 @@ def readiness(record: CaseRecord, now: Now) -> Readiness | None:
     if lost is not None and not needle_may_be_in(record) and _went_on(record, procedure_id):
         return None  # nobody was ever told READY of it, or the needle is out: history
     return Readiness(procedure_id, arrival, lost is None and locked, lost)
+
+
+def ready_arrival(record: CaseRecord) -> tuple[int, dict[str, Any]] | None:
+    """The approach (id and result) that came to its end last, until the needle is out.
+
+    What came first is said by the record's order. Whether the guide is at the target still is
+    another question: `readiness`.
+    """
+    done = [record.last_procedure(name, "done") for name in APPROACHES]
+    arrival = max((row for row in done if row), key=lambda row: row.procedure_id, default=None)
+    if arrival is None or arrival.result is None or arrival.ended_s is None:
+        return None
+    if record.running_procedure() is not None:
+        return None
+    out = record.last_event(NEEDLE_OUT)
+    if out is not None and out.seq > arrival.ended_seq:
+        return None
+    return arrival.procedure_id, dict(arrival.result)
 
 
 def needle_may_be_in(record: CaseRecord) -> bool:
