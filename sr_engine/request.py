@@ -129,8 +129,6 @@ def localize_request(
         raise TemplateError(f"no template: {why_not}; and no disc: {error}") from error
     if learnt is not None:  # what the two mean by the fiducial's middle differs by this
         doubt = np.diag(np.square(learnt.template.systematic_px))
-        if disc.systematic_px is not None:
-            doubt += np.diag(np.square(disc.systematic_px))
         disc = replace(
             disc,
             covariance_px2=disc.covariance_px2 + doubt,
@@ -225,6 +223,11 @@ def _found_as_disc(
         found = _found_by_outline(frames, radius_px, region, error)
     if expected_px is not None:
         _refuse_outside(found, expected_px, gate_px, mean_mm)
+    if found.systematic_px is not None:
+        # a calibration by discs knows no common part, so it counts in full, for any target
+        common = np.diag(np.square(found.systematic_px))
+        whole = found.covariance_px2 + common
+        found = replace(found, covariance_px2=whole, systematic_px=None)
     return found
 
 

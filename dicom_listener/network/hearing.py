@@ -27,7 +27,13 @@ from dicom_listener.network.services import why_not_served
 _HEAD_BYTES = 6
 # the state machine's names: of a connection that is gone, of a PDU that may not be, of states
 _CLOSED, _INVALID = "Evt17", "Evt19"
-_PHASES = {"Sta2": Phase.SILENT, "Sta3": Phase.ASKED, "Sta6": Phase.OPEN, "Sta8": Phase.RELEASING}
+_PHASES = {
+    "Sta1": Phase.SILENT,
+    "Sta2": Phase.SILENT,
+    "Sta3": Phase.ASKED,
+    "Sta6": Phase.OPEN,
+    "Sta8": Phase.RELEASING,
+}
 
 
 class Hearing:
@@ -41,6 +47,7 @@ class Hearing:
         self._association, self._sock, self._account = association, sock, account
         self._conversation = Conversation(self._why_not_served)
         self._reports_out = 0
+        self._is_asked = False
         self._is_over = False  # what comes after its end is not looked at
         association.bind(evt.EVT_DIMSE_SENT, self._on_sent)
         association.dul._read_pdu_data = self.read
@@ -52,7 +59,7 @@ class Hearing:
             if self._is_over:
                 self._sock.discard()
                 return
-            pdu, event = self._next_pdu(_PHASES.get(dul.state_machine.current_state, Phase.OVER))
+            pdu, event = self._next_pdu(self._phase)
         except OSError:  # the socket has noted why
             dul.event_queue.put(_CLOSED)
         except BreachError as breach:
@@ -62,6 +69,12 @@ class Hearing:
         else:
             dul.event_queue.put(event)
             dul._recv_pdu.put(pdu)
+
+    @property
+    def _phase(self) -> Phase:
+        phase = _PHASES.get(self._association.dul.state_machine.current_state, Phase.OVER)
+        # the state machine has not heard yet of what was read just before
+        return Phase.ASKED if phase is Phase.SILENT and self._is_asked else phase
 
     def _end(self, kind: str, why: str) -> None:
         self._is_over = True
@@ -77,6 +90,7 @@ class Hearing:
         is_message = kind == P_DATA and phase is Phase.OPEN
         try:
             check_turn(kind, phase)
+            self._is_asked |= kind == ASSOCIATE_RQ
             body = self._whole(size)
             if is_message and self._conversation.take(memoryview(body)):
                 sock.message_whole()

@@ -2,6 +2,7 @@
 
 import contextlib
 import socket
+import ssl
 import struct
 import subprocess
 from collections.abc import Iterator
@@ -23,11 +24,12 @@ from raw_pdus import (
     status_of,
     store_command,
 )
-from test_scp import Serving, serving
+from test_scp import Serving, certificates, serving
 
 from dicom_listener.negotiation import is_storage
 from dicom_listener.network.association_request import MalformedRequestError, mended_request
 from dicom_listener.network.conversation import BreachError, Phase, check_turn
+from dicom_listener.scp import tls_context
 
 ACCEPTED, REJECTED, DATA, RELEASED, ABORTED = 2, 3, 4, 6, 7
 pytestmark = pytest.mark.filterwarnings("ignore:.*UI.*:UserWarning")
@@ -328,11 +330,36 @@ def test_of_the_protocol_versions_that_are_offered_ours_must_be_one(tmp_path, ve
         assert server.count("association_endings_total", ending="not_offered") == 1
 
 
-def test_a_message_before_the_association_is_accepted_ends_it_with_a_line():
-    with pytest.raises(BreachError, match="a message before the association was accepted"):
-        check_turn(DATA, Phase.ASKED)
+def test_a_message_before_the_association_is_accepted_ends_it_with_a_line(tmp_path):
+    with serving(tmp_path) as server:
+        with connected(server, associate() + p_data(3, store_command("1.2.3"))) as sock:
+            wait_for(lambda: endings(server))
+            sock.recv(1)
+        assert "a message before the association was accepted" in endings(server)[0]
+        assert server.count("association_endings_total", ending="out_of_turn") == 1
     with pytest.raises(BreachError, match="a message after the request for a release"):
         check_turn(DATA, Phase.RELEASING)
+
+
+@pytest.mark.parametrize(
+    ("said", "ending", "why"),
+    [
+        (p_data(3, store_command("1.2.3")), "out_of_turn", "a message before any association"),
+        (pdu(9), "unreadable", "an unknown kind of PDU (0x09)"),
+    ],
+)
+def test_over_tls_it_is_named_too(tmp_path, said, ending, why):
+    certificates(tmp_path)
+    ours, key, authority = (tmp_path / name for name in ("ours.crt", "ours.key", "authority.crt"))
+    trusting = ssl.create_default_context(cafile=str(authority))
+    trusting.load_cert_chain(ours, key)
+    with serving(tmp_path, tls_context(ours, key, authority)) as server:
+        plain = socket.create_connection(("127.0.0.1", server.port), 60)
+        with trusting.wrap_socket(plain, server_hostname="localhost") as sock:
+            sock.sendall(said)
+            wait_for(lambda: endings(server))
+        assert endings(server)[0].startswith(f"connection of 127.0.0.1: {why}")
+        assert server.count("association_endings_total", ending=ending) == 1
 
 
 def test_a_cancel_is_named_and_the_slice_behind_it_comes_through(tmp_path):
