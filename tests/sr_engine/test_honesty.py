@@ -4,10 +4,13 @@ import numpy as np
 import pytest
 from scipy.special import j1
 
+from dicom_slice.geometry import SliceGeometry
 from sr_engine.errors import EngineError, NoRoundObjectError, NotConvergedError
 from sr_engine.localize import localize
 from sr_engine.psf import Psf
+from sr_engine.request import localize_request
 from sr_engine.simulate import filtered_noise, render_disc
+from sr_engine.views import Frames
 
 KINDS = ("flat", "hamming", "fermi", "elliptical")
 ACQUIRED = ((1.0, 1.0), (0.8, 0.8), (2 / 3, 2 / 3), (0.5, 0.5), (1.0, 0.5))
@@ -104,17 +107,29 @@ def test_the_disc_fit_of_an_oval_says_what_its_mask_may_have_done(ratio: float) 
     assert np.max(sigmas) < 4
 
 
-def test_what_draws_a_disc_in_all_frames_alike_is_apart_and_does_not_average_out() -> None:
-    """A spot at one side draws the centre of one frame as that of eight: only the noise shrinks."""
+def with_a_spot(
+    centre: np.ndarray,
+    shifts: np.ndarray,
+    level: float = 0.2,
+    radius: float = 1.5,
+    away: float = 2.5,
+) -> list[np.ndarray]:
+    """Frames of a disc, R 5 px, with a fainter spot that moves with it."""
     rng = np.random.default_rng(8)
-    centre = np.array((50.2, 61.9))
-    shifts = rng.uniform(-0.5, 0.5, (8, 2))
     frames = []
     for place in centre + shifts:
-        spot = render_disc((100, 124), tuple(place + np.array((0, 2.5))), 1.5)
-        clean = render_disc((100, 124), tuple(place), 5.0) + 0.2 * spot
+        spot = render_disc((100, 124), tuple(place + np.array((0, away))), radius)
+        clean = render_disc((100, 124), tuple(place), 5.0) + level * spot
         noise = rng.normal(0, 1 / 60, (2, *clean.shape))
         frames.append(np.hypot(clean + noise[0], noise[1]))
+    return frames
+
+
+def test_what_draws_a_disc_in_all_frames_alike_is_apart_and_does_not_average_out() -> None:
+    """A spot at one side draws the centre of one frame as that of eight: only the noise shrinks."""
+    centre = np.array((50.2, 61.9))
+    shifts = np.random.default_rng(9).uniform(-0.5, 0.5, (8, 2))
+    frames = with_a_spot(centre, shifts)
     one = localize(frames[0], start_px=centre + shifts[0], radius_px=(2.5, 6.5), robust=False)
     eight = localize(frames, shifts, start_px=centre, radius_px=(2.5, 6.5), robust=False)
     assert one.systematic_px is not None
@@ -124,6 +139,20 @@ def test_what_draws_a_disc_in_all_frames_alike_is_apart_and_does_not_average_out
     bias = float(eight.centre_px[1] - centre[1])
     assert 1.5 * noise_px[1] < abs(bias) < 2 * eight.sigma_px[1]
     assert eight.sigma_px == pytest.approx(np.hypot(noise_px, eight.systematic_px))
+
+
+def test_in_a_room_what_draws_a_disc_counts_for_every_target() -> None:
+    """A calibration by discs knows no part that is common to all places."""
+    centre = np.array((50.2, 61.9))
+    frames = np.array(with_a_spot(centre, np.zeros((1, 2)), 0.3, 3, 3))
+    geometry = SliceGeometry((0, 0, 0), (1, 0, 0), (0, 0, 1), (1.0, 1.0), frames[0].shape)
+    request = {"radius_mm": (2.5, 6.5), "expected_plane_mm": None, "gate_mm": None}
+    found = localize_request(Frames(frames, np.zeros((1, 2)), geometry, ()), "ml", request).by
+    alone = localize(frames, start_px=found.centre_px, radius_px=(2.5, 6.5))
+    assert alone.systematic_px is not None
+    assert np.min(alone.systematic_px) > 0
+    assert found.systematic_px is None
+    assert np.sqrt(np.diag(found.covariance_px2)) == pytest.approx(alone.sigma_px, rel=0.2)
 
 
 def test_the_oval_is_not_taken_for_lopsided() -> None:
