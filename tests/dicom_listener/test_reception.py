@@ -28,6 +28,7 @@ class Room:
         self.cases = Cases(folder / "cases")
         self.inbox = Inbox(self.cases.home / "inbox")
         self.sent = 0
+        self.records: list[CaseRecord] = []
         self.start()
 
     def start(self) -> None:
@@ -46,6 +47,7 @@ class Room:
     def begin(self, settled_s_ago: float = 5.0) -> CaseRecord:
         folder = self.cases.make_folder()
         record = CaseRecord(folder, create=True)
+        self.records.append(record)
         record.start_case("room", 0)
         sync_clock(record, 0.0, 0.05, "tester")
         begin_hold(record, time.time() - settled_s_ago, expected=100)
@@ -111,6 +113,8 @@ def room(tmp_path):
     running = Room(tmp_path)
     yield running
     running.stop()
+    for record in running.records:
+        record.close()
 
 
 def states(record: CaseRecord) -> list[str]:
