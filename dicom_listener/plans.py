@@ -88,12 +88,21 @@ def _in_patient(record: CaseRecord, point: PlanPoint) -> Place:
 
 def _on_slice(record: CaseRecord, at: OnImage) -> Place:
     rows = record.slices(sop_instance_uid=at.sop_instance_uid)
-    known = [row for row in rows if row.frame == at.frame and row.header.get("geometry")]
+    if at.frame is None and len({row.frame for row in rows}) > 1:
+        raise _NoPlaceError("lies on an image of several frames and names none of them")
+    wanted = [row for row in rows if at.frame in (None, row.frame)]
+    if any(row.reason_code == Reason.MOSAIC for row in wanted):
+        raise _NoPlaceError("lies on a mosaic of several slices")
+    known = [row for row in wanted if row.header.get("geometry")]
     _check_ours(known)
     geometries = {_geometry(row) for row in known}
     if len(geometries) != 1:
         raise _NoPlaceError("lies on an image whose UID is not unique in this case")
-    x, y, z = geometries.pop().patient_from_pixel([at.row_px, at.col_px]).tolist()
+    geometry = geometries.pop()
+    n_rows, n_cols = geometry.shape
+    if not (-0.5 <= at.row_px <= n_rows - 0.5 and -0.5 <= at.col_px <= n_cols - 0.5):
+        raise _NoPlaceError(f"lies outside its image of {n_rows} x {n_cols} pixels")
+    x, y, z = geometry.patient_from_pixel([at.row_px, at.col_px]).tolist()
     return (x, y, z), _frame_of(known)
 
 

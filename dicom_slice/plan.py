@@ -6,6 +6,7 @@ A point is given in patient mm (LPS) of a frame of reference, or on an image tha
 a label and is no such point is kept with the reason, so that nobody waits for it in vain.
 """
 
+import math
 import re
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -32,14 +33,16 @@ PLAN_CLASSES = {
 TARGET, ENTRY = "TARGET", "ENTRY"
 _LABEL = re.compile(r"\s*(TARGET|ENTRY)(?:[ _-]?POINT)?(?:[ _#-]*\d{1,3})?\s*", re.IGNORECASE)
 _MOST_POINTS, _DEEPEST, _MOST_ITEMS = 1000, 12, 20_000
+_BESIDE_PX = 2.0  # a text's anchor and the point that it names
 
 
 @dataclass(frozen=True)
 class OnImage:
-    """A point (row, col) on a frame (0 first) of an image; (0, 0) is the centre of a pixel."""
+    """A point (row, col) on an image; (0, 0) is the centre of a pixel. frame: 0 first; None: the
+    image's only one."""
 
     sop_instance_uid: str
-    frame: int
+    frame: int | None
     row_px: float
     col_px: float
 
@@ -158,8 +161,11 @@ def _of_presentation(data_set: Dataset) -> Iterator[PlanPoint]:
         drawn = layer or (beside.pop() if len(beside) == 1 else "")
         graphics = annotation.get("GraphicObjectSequence") or ()
         points = [item for item in graphics if item.get("GraphicType") == "POINT"]
-        for item in points if drawn else ():
+        elsewhere = not layer and any(_is_elsewhere(text, points) for _, text in texts)
+        for item in points if drawn and not elsewhere else ():
             yield _drawn(drawn, images, item.GraphicData, item.get("GraphicAnnotationUnits"))
+        if drawn and points and elsewhere:
+            yield PlanPoint(drawn, why="has its text at one place and a point at another")
         if layer and graphics and not points:
             yield PlanPoint(layer, why=f"is a {graphics[0].get('GraphicType')}, not a POINT")
         for label, text in texts:
@@ -170,6 +176,19 @@ def _of_presentation(data_set: Dataset) -> Iterator[PlanPoint]:
                 yield _drawn(label, images, at, units)
             else:
                 yield PlanPoint(label, why="is a text that points at nothing")
+
+
+def _is_elsewhere(text: Dataset, points: Sequence[Dataset]) -> bool:
+    """Whether a text is anchored at none of the points: a viewer may put all into one item."""
+    at = text.get("AnchorPoint")
+    if not at or not points:
+        return False
+    units = text.get("AnchorPointAnnotationUnits")
+    return not any(
+        item.get("GraphicAnnotationUnits") == units
+        and math.dist(map(float, at), map(float, item.GraphicData)) <= _BESIDE_PX
+        for item in points
+    )
 
 
 def _drawn(label: str, images: Sequence[Dataset], at: Any, units: Any) -> PlanPoint:
@@ -276,7 +295,7 @@ def _on(label: str, images: Sequence[Dataset], data: Any) -> PlanPoint:
     if len(numbers) > 1:
         why = f"is drawn on {len(numbers)} frames: it must be on one, to have a depth"
         return PlanPoint(label, why=why)
-    frame = int(numbers[0]) - 1 if numbers else 0
+    frame = int(numbers[0]) - 1 if numbers else None
     uid = str(images[0].ReferencedSOPInstanceUID)
     return PlanPoint(label, on_image=OnImage(uid, frame, row - 0.5, col - 0.5))
 

@@ -75,10 +75,10 @@ class KeptInstances:
                 self._known.add(path)
                 try:
                     envelope, _ = read_envelope(path)
-                except FileNotFoundError:
-                    self._known.discard(path)
-                except (OSError, NotFromInboxError):
+                except NotFromInboxError:
                     continue
+                except OSError:  # moved, or not to be read just now: it is looked at again
+                    self._known.discard(path)
                 else:
                     classes = self._classes.setdefault(envelope.sop_instance_uid, {})
                     classes[path] = envelope.sop_class_uid

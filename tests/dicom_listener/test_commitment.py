@@ -195,3 +195,15 @@ def test_a_console_that_cannot_be_told_is_an_alarm(tmp_path):
 def test_an_address_that_is_none_is_a_configuration_error(place):
     with pytest.raises(ValidationError, match="is not host:port"):
         ListenerConfig(commitment_reports_to={"CONSOLE": place})
+
+
+def test_a_file_that_could_not_be_read_once_is_looked_at_again(tmp_path):
+    room, elsewhere = Inbox(tmp_path / "room"), Inbox(tmp_path / "elsewhere")
+    kept = kept_in(room.folder)
+    path = stored(elsewhere, "1.2.1")
+    there = room.folder / path.name
+    there.mkdir()  # whatever opens it gets an OSError
+    assert kept.problem(MR_IMAGE, "1.2.1") == 0x0112
+    there.rmdir()
+    path.rename(there)
+    assert kept.problem(MR_IMAGE, "1.2.1") is None

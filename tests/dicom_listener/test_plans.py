@@ -22,7 +22,7 @@ from made_slices import begin_hold, mr_data_set
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.sr.codedict import codes
 from pydicom.uid import ExplicitVRLittleEndian, generate_uid
-from test_intake import Desk
+from test_intake import Desk, enhanced
 
 FRAME = "1.2.826.0.1.4"
 TARGET, ENTRY = (3.5, 12.25, -4.0), (4.0, -40.0, 8.0)
@@ -287,6 +287,25 @@ def over_two_images() -> FileDataset:
     return made
 
 
+def outside_of_the_image() -> FileDataset:
+    made = fiducial_on_image(reference())
+    (point,) = made.FiducialSetSequence[0].FiducialSequence
+    point.GraphicCoordinatesDataSequence[0].GraphicData = [900.0, 20.5]
+    return made
+
+
+def text_away_from_the_point() -> FileDataset:
+    """All drawings of an image in one item, as some viewers store them."""
+    made = presentation_state()
+    target, entry = made.GraphicAnnotationSequence
+    target.GraphicLayer = "DRAWN"
+    (text,) = entry.TextObjectSequence
+    text.UnformattedTextValue = "TARGET"
+    target.TextObjectSequence = [text]
+    del made.GraphicAnnotationSequence[1]
+    return made
+
+
 def report_of_loops() -> FileDataset:
     """Every item below refers to the whole again."""
     inner = [by_reference(1) for _ in range(40)]
@@ -307,6 +326,8 @@ def report_of_loops() -> FileDataset:
         (content(coordinates("MULTIPOINT", [*TARGET, *ENTRY])), "TARGET is a MULTIPOINT of 6"),
         (content(coordinates("POINT", [1.0, 2.0])), "TARGET is drawn on no image"),
         (content(coordinates("POINT", [1.0, 2.0], by_reference(1, 7))), "drawn on no image"),
+        (outside_of_the_image(), "TARGET lies outside its image"),
+        (text_away_from_the_point(), "TARGET has its text at one place and a point at another"),
         (report_of_loops(), "it is damaged"),
     ],
 )
@@ -322,6 +343,21 @@ def test_a_point_on_a_slice_that_does_not_belong_to_the_case_is_refused(desk):
     (row,) = desk.receive(other)
     assert row.reason_code == "other_frame_of_reference"
     assert "does not belong to this case" in noted(desk, presentation_state("1.2.826.0.77"))["why"]
+
+
+def test_a_point_on_an_image_of_several_frames_names_the_frame(desk):
+    rows = desk.receive(enhanced(3, time.time() - 1))
+    assert [row.frame for row in rows] == [0, 1, 2]
+    body = noted(desk, presentation_state("1.2.826.0.5"))
+    assert "an image of several frames and names none of them" in body["why"]
+
+
+def test_a_point_on_a_mosaic_has_no_place(desk):
+    mosaic = mr_data_set("1.2.826.0.78", began_s=time.time() - 1)
+    mosaic.ImageType = ["ORIGINAL", "PRIMARY", "M", "MOSAIC"]
+    (row,) = desk.receive(mosaic)
+    assert row.reason_code == "mosaic"
+    assert "lies on a mosaic" in noted(desk, presentation_state("1.2.826.0.78"))["why"]
 
 
 def test_a_word_beside_a_point_names_it_and_a_word_alone_needs_an_anchor(desk):
