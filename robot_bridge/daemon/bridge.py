@@ -209,7 +209,8 @@ class Bridge:
         self._follow_motors(now_s)
 
     def _follow_motors(self, now_s: float) -> None:
-        in_haste = self.moving or self.motors.status.setting_up
+        status = self.motors.status
+        in_haste = self.moving or status.setting_up or status.locating
         period_s = self.settings.motion_poll_s if in_haste else IDLE_POLL_S
         if not self.motors.poll_if_due(period_s):
             return
@@ -222,6 +223,8 @@ class Bridge:
             self.motors.stop_again_if_due()
 
     def _follow_idle_motors(self) -> None:
+        if self.motors.status.locating:
+            return  # a stop would end the question where it stands, again and again
         if self.motors.status.moving:
             self._stop_stray_motion()
         elif self.motors.status.fault is not None and self.armed:

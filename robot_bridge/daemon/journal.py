@@ -140,6 +140,8 @@ class Journal:
             if kind == "stand":
                 certain = entry.get("certain", self.stands)  # older journals do not say
                 self.settled = {a: self.stands[a] for a in certain if a in self.stands}
+            else:  # an axis that homes stands nowhere that is known
+                self.settled = {a: s for a, s in self.settled.items() if a in self.stands}
         elif kind == "boards":
             self.boards |= entry["boards"]
         elif kind == "lock":

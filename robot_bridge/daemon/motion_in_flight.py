@@ -204,6 +204,8 @@ class MotionInFlight:
 
     def _know_afterwards(self, motion: Motion, ending: Ending) -> None:
         """Where the axes stand now: where they read if they are certain, else somewhere between."""
+        if not motion.started:
+            return
         status = self._motors.status
         readback_um = status.readback_um
         if motion.homing:
@@ -213,13 +215,13 @@ class MotionInFlight:
                 self._certain |= homed & status.certain_axes
                 self.whereabouts.homed({axis: readback_um[axis] for axis in homed})
             return
-        if not motion.started:
-            return
         going = self.whereabouts.going(motion.record.setpoints_um)
         within_um = {a: status.within_um[a] for a in going.keys() & status.within_um.keys()}
         self.whereabouts.arrived(readback_um, self.certain_axes, within_um)
         lost = {axis: stand for axis, stand in going.items() if axis not in self.certain_axes}
         self.whereabouts.ended_early(lost, readback_um, within_um)
+        others = readback_um.keys() - self.certain_axes - going.keys()
+        self.whereabouts.strayed(others, readback_um)
 
     def _finish(self, ending: Ending) -> None:
         assert self._motion is not None

@@ -36,6 +36,7 @@ class MotorStatus:
         ended.
     fault: a short code while something is wrong (a fault ends the motion), else None.
     boards: the serial number of each axis's controller, "" if it tells none.
+    locating: nothing moves but what was stopped, and where that stands is being asked.
     setting_up: controllers are being initialised (again); poll as often as during a motion.
     supply: by axis what the controller measures of itself: volts and degrees Celsius.
     """
@@ -50,6 +51,7 @@ class MotorStatus:
     fault_text: str = ""
     warnings: tuple[str, ...] = ()
     setting_up: bool = False
+    locating: bool = False
     boards: Mapping[str, str] = field(default_factory=dict)
     supply: Mapping[str, Mapping[str, float]] = field(default_factory=dict)
 

@@ -248,7 +248,7 @@ class PmdAxis(PmdRunner):
 
     def declare_count(self, count: int) -> Steps[None]:
         wanted_um = pmd_units.um_from_count(self.config, count)
-        if self.tells_index:
+        if self.tells_index and (yield from self.ask("N")).integer() != self.index_at_rest:
             yield from disarm_index(self)  # E does it as well, where it has to be written
         yield from self.read_position()
         if self.position_um != wanted_um:
@@ -263,7 +263,7 @@ class PmdAxis(PmdRunner):
         self.at_rest_um = self.position_um
         self.certain = self.believes_mark = True
         self._cut = self._cut_leg = self.within_um = None
-        self.fault = None
+        self.fault, self.unread = None, False
 
     # Stopping
 

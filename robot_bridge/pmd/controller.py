@@ -57,6 +57,9 @@ class AxisFaultError(PmdError):
         self.code = code
 
 
+MICROSTEP_PHASE = "Y0", "the length of a run cannot be checked afterwards"
+
+
 class PmdController:
     """`needs_setup`: its settings are not known to be ours; nothing moves until they are.
 
@@ -95,6 +98,7 @@ class PmdController:
         self.proven = False  # the encoder was seen to follow the motor since the board was set up
         self.settings: dict[int, int] = {}  # Y numbers as they were set and read back
         self.tells_index = False
+        self.index_at_rest = INDEX_OFF  # what N reads once nobody searches the index
         self.seeks_index = False  # homing has armed it
         self._index_passed = False  # or perhaps: an answer was not heard
         self.index_trapped = False  # it may have reset the count, or stopped the motor
@@ -222,7 +226,7 @@ class PmdController:
             return
         mode = (yield from self.ask("N")).integer() if self.tells_index else None
         self._index_passed = False
-        self.index_trapped = mode != INDEX_OFF
+        self.index_trapped = mode != self.index_at_rest
         if self.index_trapped:
             self.needs_setup = True
             self.lose_position()

@@ -316,8 +316,10 @@ class PmdMotors:
 
     def _status(self) -> MotorStatus:
         fault = self._fault or next((a.fault for a in self._axes.values() if a.fault), None)
+        unread = {name for name, axis in self._axes.items() if axis.unread}
         return MotorStatus(
-            moving=bool(self._motion) or any(axis.unread for axis in self._axes.values()),
+            moving=bool(self._motion or unread),
+            locating=not self._motion and bool(unread) and unread <= self._other.keys(),
             reached=self._reached,
             fault=fault[0] if fault else None,
             fault_text=fault[1] if fault else "",

@@ -20,6 +20,7 @@ from robot_bridge.pmd.status import Inputs
 
 CHUNK_UM = 2000.0  # of a run towards a mechanical end, between two looks at the encoder
 BACK_OFF_UM, PULL_OFF_UM, BACK_OFF_S = 1000.0, 500.0, 1.0
+SWITCH_DELAY_S = 0.02  # a switch may tell so late, and the motor stop: on the faster of two trips
 
 
 def home(axis: PmdAxis, home_um: int) -> Procedure:
@@ -92,7 +93,7 @@ def _home_to_switch(axis: PmdAxis, home_um: int) -> Steps[None]:
     yield from _leave(axis, -outwards * back_um, name)
     if not (yield from _run_to_switch(axis, outwards * 2 * back_um, _slow_hz(axis))):
         raise _cannot(axis, f"the {name} limit switch did not trip again")
-    yield from axis.read_position()
+    yield from axis.read_position_surely()
     second_um = axis.position_um
     if abs(second_um - first_um) > _trips_within_um(axis, back_um):
         raise _cannot(
@@ -113,8 +114,10 @@ def _slow_hz(axis: PmdAxis) -> int:
 
 
 def _trips_within_um(axis: PmdAxis, back_um: float) -> float:
-    """How far two trips of the same switch may seem to differ."""
-    least_um = max(axis.config.tolerance_um, axis.jitter_um)
+    """How far two trips of the same switch may seem to differ: the first is the faster one."""
+    step_um = max(axis.config.step_um_forward, axis.config.step_um_reverse)
+    late_um = SWITCH_DELAY_S * step_um * (axis.speed_hz - _slow_hz(axis))
+    least_um = max(axis.config.tolerance_um, axis.jitter_um) + late_um
     if axis.closed_loop:
         return least_um
     return least_um + 2 * axis.config.step_error * back_um + (axis.within_um or 0.0)
@@ -156,7 +159,7 @@ def _leave(axis: PmdAxis, distance_um: float, name: str) -> Steps[None]:
 def _expect_encoder(axis: PmdAxis, from_um: float, distance_um: float) -> Steps[None]:
     if not axis.closed_loop:
         return
-    yield from axis.read_position()
+    yield from axis.read_position_surely()
     moved_um = axis.position_um - from_um
     if not agrees(moved_um, distance_um):
         raise _cannot(axis, disagreement(moved_um, distance_um))
@@ -211,8 +214,7 @@ def _home_to_index(axis: PmdAxis, home_um: int) -> Steps[None]:
     if not axis.tells_index:
         raise _cannot(axis, "its controller does not answer N: the index is not known to pass")
     outwards = _outwards(axis, home_um)
-    reply = yield from axis.ask_if_it_can(f"Y{INDEX_POSITION}", "its index is taken for count 0")
-    at_index = reply.integer() if reply else 0
+    at_index = yield from _count_at_index(axis)
     for direction in (outwards, -outwards):
         yield from axis.read_position()
         from_um = axis.position_um
@@ -225,6 +227,15 @@ def _home_to_index(axis: PmdAxis, home_um: int) -> Steps[None]:
             return
         yield from _expect_any_motion(axis, from_um)
     raise _cannot(axis, "the encoder's index was not found in either direction")
+
+
+def _count_at_index(axis: PmdAxis) -> Steps[int]:
+    """Y14, twice alike: the line has no checksum."""
+    told = (yield from axis.ask(f"Y{INDEX_POSITION}")).integer()
+    again = (yield from axis.ask(f"Y{INDEX_POSITION}")).integer()
+    if again != told:
+        raise _cannot(axis, f"the count at its index reads {told}, then {again}")
+    return told
 
 
 def _expect_any_motion(axis: PmdAxis, from_um: float) -> Steps[None]:

@@ -10,7 +10,13 @@ from collections.abc import Callable
 from robot_bridge.daemon.config import AxisConfig
 from robot_bridge.pmd import protocol as pmd_protocol
 from robot_bridge.pmd import units as pmd_units
-from robot_bridge.pmd.controller import POLL_PAUSE_S, POWER_ON_DELAY_US, PmdController, Steps
+from robot_bridge.pmd.controller import (
+    MICROSTEP_PHASE,
+    POLL_PAUSE_S,
+    POWER_ON_DELAY_US,
+    PmdController,
+    Steps,
+)
 from robot_bridge.pmd.line import Pause
 from robot_bridge.pmd.progress import StandWatch
 from robot_bridge.pmd.protocol import (
@@ -196,9 +202,7 @@ class PmdRunner(PmdController):
 
     def _microstep_phase(self) -> Steps[int | None]:
         """None if the board does not tell; the end of a run is then known by its status alone."""
-        reply = yield from self.ask_if_it_can(
-            "Y0", "the length of a run cannot be checked afterwards"
-        )
+        reply = yield from self.ask_if_it_can(*MICROSTEP_PHASE)
         if reply is None:
             return None
         values = reply.integers()

@@ -13,6 +13,7 @@ from robot_bridge.pmd.controller import (
     INDEX_OFF,
     INITIALISED_MARK,
     MARK,
+    MICROSTEP_PHASE,
     MODELS,
     POWER_ON_DELAY_US,
     PmdController,
@@ -52,6 +53,7 @@ def initialise(c: PmdController) -> Steps[None]:
         and at_index != INDEX_HAS_RESET
     )
     yield from _probe_storing(c)
+    yield from c.ask_if_it_can(*MICROSTEP_PHASE)  # silence later is the line's
     moved = yield from _apply_settings(c)
     yield from c.read_position()
     c.certain = declared and c.closed_loop and not moved
@@ -152,9 +154,9 @@ def disarm_index(c: PmdController) -> Steps[int | None]:
     found = reply.integer()
     yield Command(c.address, f"N{INDEX_OFF}", reads=False)
     now = (yield from c.ask("N")).integer()
-    if now != INDEX_OFF:
+    if now not in (INDEX_OFF, INDEX_HAS_RESET):  # the latter tells of a search that is over
         raise c.error("setting", f"N reads {now} after it was set to {INDEX_OFF}")
-    c.tells_index = True
+    c.tells_index, c.index_at_rest = True, now
     return found
 
 
@@ -162,9 +164,9 @@ def _check_index(c: PmdController) -> Steps[None]:
     if not (c.tells_index and c.closed_loop):
         return
     mode = (yield from c.ask("N")).integer()
-    if mode != INDEX_OFF:
+    if mode != c.index_at_rest:
         mode = (yield from c.ask("N")).integer()  # it may have been the line
-    if mode != INDEX_OFF:
+    if mode != c.index_at_rest:
         c.needs_setup = True
         c.lose_position()
         raise c.error("index", f"the encoder's index was armed: N reads {mode}")
