@@ -128,7 +128,7 @@ def test_a_template_that_lacks_a_slice_since_says_which_measurement_and_what_to_
     row = recorded.record.measurements("done")[0]
     for slice_id in row.result["slice_ids"]:
         reassign(recorded.record, slice_id, None, "Olga", "a doubtful one")
-    why = f"measurement {row.measurement_id}, .* was set aside since: calibrate again"
+    why = f"measurement {row.measurement_id}, .* has since been set aside: calibrate again"
     with pytest.raises(UnusableSlicesError, match=why):
         view_of(recorded.record, row.measurement_id)
 
@@ -175,6 +175,6 @@ def test_of_the_absolute_centre_counts_what_the_targets_kind_says():
     judged = told.as_judged(start.estimate).covariance_mm2 - start.estimate.covariance_mm2
     assert np.allclose(judged, np.diag([0.0009, 0.0016]))
     # 0.06 mm cannot be said of a place in tissue with that, 0.1 mm can
-    assert "known to 0.040 mm" in told.why_never_sure()
+    assert "known only to 0.040 mm" in told.why_never_sure()
     wider = replace(told, tolerance_mm=0.1)
     assert wider.why_never_sure() == ""
