@@ -294,6 +294,7 @@ class PmdMotors:
         if failed != axis.fault:
             log.warning("%s", failed[1])
         axis.fault = failed
+        axis.proven = False  # a stall in the run that proves a wrong scale looks like a right one
         if isinstance(error, PmdEchoError):
             axis.lose_position()
         return failed

@@ -171,3 +171,22 @@ def test_what_a_cut_run_has_gone_is_between_its_bounds(
 def test_a_run_that_nobody_saw_turn_may_be_anything():
     run = run_of(-8192, 0.0, math.inf, [])
     assert Pace().microsteps_gone(run) == (-0.0, -8192)
+
+
+def test_a_stall_in_its_proof_does_not_make_a_wrong_scale_a_right_one():
+    """By half of the way and twice the counts the encoder seems to have followed."""
+    bench = Bench(names=("xt",), motor=Motor(um_per_count=0.05))
+    bench.motors.move_to({"xt": 436})
+    while bench.truth_um() < 100:
+        bench.motors.poll()
+        bench.line.wait(0.002)
+    bench.board.faults.stalled = True
+    assert bench.finish().fault == "stalled"
+    bench.board.faults.stalled = False
+    bench.rest()
+    bench.motors.declare_position({"xt": round(bench.truth_um())})
+    bench.motors.move_to({"xt": 4000})
+    status = bench.finish()
+    assert status.fault == "encoder_disagrees"
+    assert "xt" not in status.certain_axes
+    assert bench.truth_um() < 500
