@@ -223,12 +223,13 @@ class Bridge:
             self.motors.stop_again_if_due()
 
     def _follow_idle_motors(self) -> None:
-        if self.motors.status.locating:
+        status = self.motors.status
+        if status.locating:
             return  # a stop would end the question where it stands, again and again
-        if self.motors.status.moving:
+        if status.moving:
             self._stop_stray_motion()
-        elif self.motors.status.fault is not None and self.armed:
-            self.stop_for(Code.MOTOR_FAULT, self.motors.status.fault_text)
+        elif status.fault is not None and self.armed:
+            self.stop_for(Code.MOTOR_FAULT, status.fault_text)
         elif self.phase is WorkPhase.EMERGENCY:
             self.motors.park_again_if_due()
 

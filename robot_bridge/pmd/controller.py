@@ -95,7 +95,7 @@ class PmdController:
         self.can_store = True
         self.estop = False  # the emergency stop's input is low
         self.limit_wiring = 0  # Y2
-        self.proven = False  # the encoder was seen to follow the motor since the board was set up
+        self.proven = False  # since set-up and the last fault the encoder was seen to follow
         self.settings: dict[int, int] = {}  # Y numbers as they were set and read back
         self.tells_index = False
         self.index_at_rest = INDEX_OFF  # what N reads once nobody searches the index
@@ -228,8 +228,12 @@ class PmdController:
         self._index_passed = False
         self.index_trapped = mode != self.index_at_rest
         if self.index_trapped:
-            self.needs_setup = True
-            self.lose_position()
+            self.lose_to_index()
+
+    def lose_to_index(self) -> None:
+        """It was armed by somebody: the count may have been reset, and it is to be disarmed."""
+        self.needs_setup = True
+        self.lose_position()
 
     def mark_stands(self) -> Steps[bool]:
         """Without a mark nothing speaks against a reset: it is believed to have been one."""

@@ -167,8 +167,7 @@ def _check_index(c: PmdController) -> Steps[None]:
     if mode != c.index_at_rest:
         mode = (yield from c.ask("N")).integer()  # it may have been the line
     if mode != c.index_at_rest:
-        c.needs_setup = True
-        c.lose_position()
+        c.lose_to_index()
         raise c.error("index", f"the encoder's index was armed: N reads {mode}")
 
 
