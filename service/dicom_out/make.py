@@ -122,9 +122,9 @@ def encoded(dataset: Dataset) -> bytes:
     content, lacks_letters = _saved(copy.deepcopy(dataset))
     if not lacks_letters:
         return content
-    for _ in dataset.iterall():
-        pass  # what was read and not looked at yet is still in the former character set
-    dataset.SpecificCharacterSet = "ISO_IR 192"
+    from service.dicom_out.source import in_other_charset
+
+    in_other_charset(dataset, "ISO_IR 192")
     content, _ = _saved(dataset)
     return content
 

@@ -338,6 +338,13 @@ def suzukis(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("ISO_IR 192", "Yamada^Tarou=山田^太郎=やまだ^たろう"),
         ("ISO_IR 100", "Müller^Jörg"),
         (None, "Miller^George"),
+        ("ISO_IR 6", "Miller^George"),
+        ("", "Miller^George"),
+        (None, "Müller^Jörg"),
+        ("ISO 2022 IR 100", "Müller^Jörg"),
+        (["ISO_IR 13", "ISO 2022 IR 87"], "ﾔﾏﾀﾞ^ﾀﾛｳ=山田^太郎"),
+        (["", "ISO 2022 IR 149"], "Hong^Gildong=洪^吉洞=홍^길동"),
+        ("GB18030", "Wang^XiaoDong=王^小东"),
     ],
 )
 def test_names_are_written_as_they_are_whatever_the_alphabet(suzukis, tmp_path, charset, name):
