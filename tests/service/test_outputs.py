@@ -20,7 +20,7 @@ from receivers import needs_program
 from recorded_case import OFFSET_MM, TOLERANCE_MM, come_to_ready, make_case, puncture
 
 from case_record.record import CaseRecord, CaseRecordError
-from case_record.seals import TamperedError
+from case_record.seal_chain import TamperedError
 from service.cli.export import write_export
 from service.dicom_out.codes import CENTRE, CENTRE_ALONG, DEPTH, DISTANCE, PROBABILITY, TOLERANCE
 from service.dicom_out.content import finding_of_arrival, finding_of_measurement
