@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from dicom_listener.clock import (
+from dicom_listener.clock_offset import (
     LAGS_KEPT,
     ClockRules,
     Comparison,
@@ -51,6 +51,15 @@ class Drift:
         if len(self.last_s) < LAGS_KEPT:
             return 0.0
         return min(self.last_s) - min(self.first_s)
+
+
+def outdates_until_s(body: Mapping[str, Any], wall_s: float) -> float:
+    """Up to when a comparison in the room's file is older than a comparison or reset in the record.
+
+    body, wall_s: of that event. A file has no place in the order of the record. Where this computer
+    was set back, what is older may have the larger time: by the clock before, it was said later.
+    """
+    return float(body.get("at_s", wall_s)) - min(0.0, float(body.get("step_s", 0.0)))
 
 
 class ScannerClocks:
@@ -136,15 +145,17 @@ class ScannerClocks:
     def heed(self, kind: str, body: Mapping[str, Any], wall_s: float) -> None:
         """Follow an event of the record, where it concerns clocks."""
         if kind == CLOCK_COMPARED:
+            self._outdate_filed(body, wall_s)
             made = Comparison(body["offset_s"], body["uncertainty_s"], body["at_s"])
-            self._unseen = self._with_filed(self._unseen.compared(made, self._rules), made.at_s)
+            self._unseen = self._with_filed(self._unseen.compared(made, self._rules))
             self._clocks = {
-                name: self._with_filed(clock.compared(made, self._rules), made.at_s)
+                name: self._with_filed(clock.compared(made, self._rules))
                 for name, clock in self._clocks.items()
             }
         elif kind == CLOCK_FORGOTTEN:
+            self._outdate_filed(body, wall_s)
             set_at_s = body.get("at_s", wall_s)  # what was said in an earlier case has an instant
-            self._unseen = self._with_filed(ScannerClock(set_at_s=set_at_s), set_at_s)
+            self._unseen = self._with_filed(ScannerClock(set_at_s=set_at_s))
             self._clocks.clear()
         elif kind == CLOCK_DOUBTED:
             self._doubt(body)
@@ -157,11 +168,13 @@ class ScannerClocks:
         self._standing.clear()
         self._has_news = True
 
-    def _with_filed(self, clock: ScannerClock, since_s: float = -math.inf) -> ScannerClock:
+    def _outdate_filed(self, body: Mapping[str, Any], wall_s: float) -> None:
+        if self._filed is not None and self._filed.at_s <= outdates_until_s(body, wall_s):
+            self._filed = None
+
+    def _with_filed(self, clock: ScannerClock) -> ScannerClock:
         """The clock after what the room's file says, if the clocks were compared since then."""
-        if self._filed is None or self._filed.at_s <= since_s:
-            return clock
-        return clock.compared(self._filed, self._rules)
+        return clock if self._filed is None else clock.compared(self._filed, self._rules)
 
     def _doubt(self, body: Mapping[str, Any]) -> None:
         if self._filed is not None and self._filed.at_s > body["at_s"]:
@@ -171,6 +184,11 @@ class ScannerClocks:
         self._clocks[scanner] = clock.doubted(body["text"], is_certain=body["is_certain"])
         self._doubts[scanner] = dict(body)
         self._untold.discard(scanner)
+
+    @property
+    def comparison(self) -> Comparison | None:
+        """The last one that counts, for a scanner that has not sent yet."""
+        return self._unseen.comparisons[-1] if self._unseen.comparisons else None
 
     @property
     def doubts(self) -> list[dict[str, Any]]:

@@ -82,7 +82,7 @@ def _home_to_switch(axis: PmdAxis, home_um: int) -> Steps[None]:
         )
     yield from axis.read_position()
     if not (yield from _run_to_switch(axis, outwards * _search_um(axis))):
-        raise _cannot(axis, f"no limit switch after {_search_um(axis) / 1000:.1f} mm")
+        raise _cannot(axis, f"no limit switch found within {_search_um(axis) / 1000:.1f} mm")
     there = yield from axis.read_inputs()
     if not _is_on(there, name) or _is_on(there, other):
         wrong = other if _is_on(there, other) else "no"
@@ -202,7 +202,7 @@ def _run_to_end(axis: PmdAxis, outwards: int, search_um: float) -> Steps[None]:
         if outwards * moved_um < 0 or abs(moved_um) > HOMING_CHUNK_UM / FOLLOWS:
             raise _cannot(axis, disagreement(moved_um, outwards * HOMING_CHUNK_UM))
         gone_um += HOMING_CHUNK_UM
-    raise _cannot(axis, f"no end after {search_um / 1000:.1f} mm")
+    raise _cannot(axis, f"no end stop found within {search_um / 1000:.1f} mm")
 
 
 # --- the encoder's index ----------------------------------------------------------------------

@@ -14,10 +14,15 @@ from typing import Any
 
 from case_record.record import CaseRecord
 from case_record.rows import Event, Hold
-from dicom_listener.clock import ClockRules
-from dicom_listener.scanner_clocks import CLOCK_COMPARED, CLOCK_DOUBTED, CLOCK_FORGOTTEN
+from dicom_listener.clock_offset import ClockRules
+from dicom_listener.scanner_clocks import (
+    CLOCK_COMPARED,
+    CLOCK_DOUBTED,
+    CLOCK_FORGOTTEN,
+    outdates_until_s,
+)
 from room_config.load import Config
-from service.room.alarms import Condition
+from service.room.alarm_list import Condition
 from service.room.state import ClockState
 from service.room.validity import computer_start
 
@@ -44,9 +49,8 @@ def doubt(config: Config, record: CaseRecord) -> str:
     doubted = record.last_event(CLOCK_DOUBTED)
     if doubted is None:
         return ""
-    told = (record.last_event(kind) for kind in (CLOCK_COMPARED, CLOCK_FORGOTTEN))
-    filed = _from_file(config)
-    if any(event is not None and event.event_id > doubted.event_id for event in told):
+    told, filed = _last_told(record), _filed(config, record)
+    if told is not None and told.event_id > doubted.event_id:
         return ""
     if filed is not None and _made_s(filed) > doubted.body["at_s"]:
         return ""
@@ -96,11 +100,27 @@ def _made_s(compared: ClockState) -> float:
 
 
 def _last_comparison(config: Config, record: CaseRecord) -> ClockState | None:
-    compared = record.last_event(CLOCK_COMPARED)
-    forgotten = record.last_event(CLOCK_FORGOTTEN)
-    if forgotten is not None and (compared is None or compared.event_id < forgotten.event_id):
+    """What stands, as `ScannerClocks` has it: the room's file counts while it is the newer one."""
+    filed, told = _filed(config, record), _last_told(record)
+    if filed is not None or told is None or told.kind == CLOCK_FORGOTTEN:
+        return filed
+    return _from_event(told)
+
+
+def _last_told(record: CaseRecord) -> Event | None:
+    """What people said last: a comparison, or that a clock was set."""
+    said = (record.last_event(kind) for kind in (CLOCK_COMPARED, CLOCK_FORGOTTEN))
+    return max((event for event in said if event), key=lambda event: event.event_id, default=None)
+
+
+def _filed(config: Config, record: CaseRecord) -> ClockState | None:
+    filed = _from_file(config)
+    if filed is None:
         return None
-    return _from_file(config) if compared is None else _from_event(compared)
+    kinds = (CLOCK_COMPARED, CLOCK_FORGOTTEN)
+    told = (event for kind in kinds for event in record.events_of_kind(kind))
+    is_old = any(_made_s(filed) <= outdates_until_s(event.body, event.wall_s) for event in told)
+    return None if is_old else filed
 
 
 def _from_event(compared: Event) -> ClockState:
@@ -192,7 +212,7 @@ def clock_was_set(config: Config, record: CaseRecord) -> list[Condition]:
     if doubted and not config.listener.arrival_mode:
         text = f"The scanner's clock is doubted: {doubted}; slices stay pending"
         return [Condition("clock_doubted", "alarm", text, "Compare the clocks again.")]
-    step = _last_step(record)
+    step = _last_step(config, record)
     if step is None:
         return []
     waits = "" if config.listener.prompt_delay_s is not None else ": slices stay pending"
@@ -200,11 +220,11 @@ def clock_was_set(config: Config, record: CaseRecord) -> list[Condition]:
     return [Condition("clock_set", "alarm", text, "Compare it with the scanner's clock.")]
 
 
-def _last_step(record: CaseRecord) -> Event | None:
-    forgotten, compared = record.last_event(CLOCK_FORGOTTEN), record.last_event(CLOCK_COMPARED)
-    if forgotten is None or "step_s" not in forgotten.body:
+def _last_step(config: Config, record: CaseRecord) -> Event | None:
+    told = _last_told(record)
+    if told is None or "step_s" not in told.body or _last_comparison(config, record) is not None:
         return None
-    return None if compared is not None and compared.seq > forgotten.seq else forgotten
+    return told
 
 
 def is_by_another_clock(record: CaseRecord, hold: Hold) -> bool:

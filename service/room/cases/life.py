@@ -99,7 +99,8 @@ def _known_of_clocks(cases: Cases) -> list[Event]:
     """What the room knows of the scanner's clock, oldest first, from the case that heard last.
 
     Since it was compared or set last, and of the last hour in any case: of two comparisons that do
-    not agree, the later one says nothing of slices that were acquired before it.
+    not agree, the later one says nothing of slices that were acquired before it. That this computer
+    was set back is told in any case: what the room's file says may seem newer than it is.
     """
     newest: list[Event] = []
     by_use = sorted(cases.folders(), key=_changed_s)
@@ -115,7 +116,9 @@ def _known_of_clocks(cases: Cases) -> list[Event]:
     if not told:
         return newest
     late = [event for event in newest if event.wall_s >= newest[-1].wall_s - _STILL_COUNTS_S]
-    return min(newest[newest.index(told[-1]) :], late, key=lambda events: events[0].event_id)
+    kept = min(newest[newest.index(told[-1]) :], late, key=lambda events: events[0].event_id)
+    set_back = [event for event in told if event.body.get("step_s", 0.0) < 0.0][-1:]
+    return [event for event in set_back if event not in kept] + kept
 
 
 def _changed_s(folder: Path) -> float:
