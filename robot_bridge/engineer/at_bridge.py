@@ -131,7 +131,9 @@ def jog(args: argparse.Namespace, config: BridgeConfig) -> None:
     with connected(args, config) as client:
         setpoints_um = dict(client.status.positions_um)
         setpoints_um[args.axis] += round(args.mm * 1000)
-        confirm(args, f"move {args.axis} by {args.mm:+g} mm to {setpoints_um[args.axis]} um")
+        known = args.axis in client.status.certain_axes
+        to = f" to {setpoints_um[args.axis]} um" if known else ""
+        confirm(args, f"move {args.axis} by {args.mm:+g} mm{to}")
         outcome = _while_armed(
             args, client, lambda: client.move(_command_id("jog"), setpoints_um, None)
         )
