@@ -193,9 +193,10 @@ def stop(args: argparse.Namespace, config: BridgeConfig) -> None:
         show(args, stop_motors(args, config))
         return
     client = _client_on_the_line(args, config)
-    _shout_stop(args.link or str(config.service_link), config.link_baud, args.emergency)
+    nonce = secrets.randbits(32)
+    _shout_stop(args.link or str(config.service_link), config.link_baud, args.emergency, nonce)
     try:
-        client.request_stop(emergency=args.emergency)
+        client.request_stop(emergency=args.emergency, nonce=nonce)
         client.open(args.timeout)
         _await_acknowledgement(client)
         show(args, _status_fields(client.status))
@@ -207,11 +208,11 @@ def stop(args: argparse.Namespace, config: BridgeConfig) -> None:
         client.close()
 
 
-def _shout_stop(url: str, baud: int, emergency: bool) -> None:
+def _shout_stop(url: str, baud: int, emergency: bool, nonce: int) -> None:
     """Before anything else, session or not, and even if another program has the line."""
     line = SerialTransport(url, baud, exclusive=False)
     try:
-        frame = encode_stop(secrets.randbits(32), emergency)
+        frame = encode_stop(nonce, emergency)
         for _ in range(SHOUTS):
             line.write(frame)
             time.sleep(0.01)
