@@ -67,11 +67,13 @@ def _places(record: CaseRecord, plan: PlanObject) -> dict[str, Any]:
 
 
 def _placed(same: list[PlanPoint]) -> list[PlanPoint]:
-    """Those that are points; what is drawn besides under the same label does not matter then."""
+    """Those that are points, or else circles; what is drawn besides under the same label does not
+    matter then.
+    """
     placed = [point for point in same if not point.why]
     if same and not placed:
         raise _NoPlaceError(same[0].why)
-    return placed
+    return [point for point in placed if not point.is_circle] or placed
 
 
 def _in_patient(record: CaseRecord, point: PlanPoint) -> Place:
