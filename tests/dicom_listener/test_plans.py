@@ -422,6 +422,15 @@ def test_a_point_on_a_slice_that_does_not_belong_to_the_case_is_refused(desk):
     assert "does not belong to this case" in noted(desk, presentation_state("1.2.826.0.77"))["why"]
 
 
+def test_of_a_slice_without_a_frame_of_reference_it_is_said_which_one_it_was(desk):
+    unnamed = mr_data_set("1.2.826.0.79", began_s=time.time() - 1)
+    del unnamed.FrameOfReferenceUID
+    (row,) = desk.receive(unnamed)
+    assert row.state == "assigned"
+    body = noted(desk, presentation_state("1.2.826.0.79"))
+    assert (body["frame_of_reference_uid"], body["slice_ids"]) == ("", [row.slice_id])
+
+
 def test_a_point_on_an_image_of_several_frames_names_the_frame(desk):
     rows = desk.receive(enhanced(3, time.time() - 1))
     assert [row.frame for row in rows] == [0, 1, 2]
