@@ -22,7 +22,7 @@ def why_not_served(command: Command, accepted: Mapping[int, str]) -> str:
     accepted: number of each accepted presentation context -> its abstract syntax.
     """
     if command.is_response:
-        return f"{command.name} to nothing that was asked"
+        return f"{command.name} without a request"
     abstract_syntax = accepted.get(command.context)
     if abstract_syntax is None:
         return f"{command.name} on presentation context {command.context}, which was not accepted"
@@ -41,7 +41,7 @@ def _why_not_stored(command: Command, accepted: set[str]) -> str:
     if not uid:
         return "a C-STORE without a SOP class"
     if not is_storage(uid):
-        return f"a C-STORE of {uid.name[:64]}, which is no kind of object that is stored"
+        return f"a C-STORE of {uid.name[:64]}, an object type that is not stored here"
     if uid not in accepted and uid_to_service_class(uid) is ServiceClass:
         return f"a C-STORE of {uid.name[:64]}, which was not proposed"
     return ""
