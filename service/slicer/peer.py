@@ -14,7 +14,7 @@ from typing import Any, Protocol
 
 import structlog
 
-from service.room.allowance import Allowances
+from service.room.commands.allowance import Allowances
 from service.room.proposals import OPENIGTLINK, Plan, Verdict
 from service.room.refusal import ConflictError
 from service.room.state import RoomState

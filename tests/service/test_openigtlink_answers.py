@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from robot_bridge.protocol.phases import WorkPhase
-from service.room.allowance import Allowance, Allowances
+from service.room.commands.allowance import Allowance, Allowances
 from service.room.proposals import Verdict
 from service.room.state import RobotState, RoomState
 from service.slicer.answers import (

@@ -13,7 +13,7 @@ import structlog
 from case_record.rows import Event
 from service.procedure.registry import latest_calibration
 from service.procedure.scan_frame import newest_frame
-from service.room.allowance import Allowances, Said
+from service.room.commands.allowance import Allowances, Said
 from service.room.commands.target import TargetCommands
 from service.room.context import RoomContext
 from service.room.proposals import (
