@@ -28,6 +28,7 @@ TO_DO = {
     "message_ignored": "Nothing is lost; see what the scanner sends besides slices.",
     "oversize": "Check what the scanner is sending: no slice is that large.",
     "plan_refused": "Correct the plan at the workstation and send it again.",
+    "plans_too_many": "Check that the proposal shown is the plan that is meant.",
     "push_delay_unlike_measured": "Compare the clocks; if it persists, commission the site again.",
     "same_uid_other_bytes": "Acquire the slice again; check which systems send to this listener.",
     "slice_refused": "Send or acquire the slice again.",
