@@ -144,7 +144,8 @@ def home(args: argparse.Namespace, config: BridgeConfig) -> None:
     with connected(args, config) as client:
         for name in args.axes:
             axis_named(config, name)
-        confirm(args, f"drive {', '.join(args.axes) or 'every axis'} to the end of its travel")
+        axes = ", ".join(args.axes) or "every axis"
+        confirm(args, f"drive {axes} to its reference, up to the end of the travel")
         outcome = _while_armed(
             args, client, lambda: client.home(_command_id("home"), args.by, args.axes)
         )
