@@ -10,7 +10,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Self
 
-from case_record import sealing
+from case_record import seal_triggers
 from case_record.sql import MIGRATIONS, SCHEMA_VERSION
 
 FILE_NAME = "case.sqlite"
@@ -58,7 +58,7 @@ class Connection:
         where = _read_only_uri(path) if read_only else path.absolute().as_uri()
         self._db = sqlite3.connect(where, timeout=busy_timeout_s, isolation_level=None, uri=True)
         self._db.row_factory = sqlite3.Row
-        sealing.prepare(self._db)
+        seal_triggers.prepare(self._db)
         try:
             if read_only:
                 self._bring_copy_up()
@@ -99,7 +99,7 @@ class Connection:
             for statement in _statements(MIGRATIONS[number]):
                 self._db.execute(statement)
             self._db.execute(f"PRAGMA user_version = {number + 1}")
-        sealing.seal_everything(self._db)
+        seal_triggers.seal_everything(self._db)
 
     def _bring_copy_up(self) -> None:
         version = self._version()
@@ -108,7 +108,7 @@ class Connection:
             return
         copy = sqlite3.connect(":memory:", isolation_level=None)
         copy.row_factory = sqlite3.Row
-        sealing.prepare(copy)
+        seal_triggers.prepare(copy)
         self._db.backup(copy)
         self._db.close()
         self._db = copy

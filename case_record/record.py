@@ -17,7 +17,7 @@ from case_record.measurements import Measurements
 from case_record.moves import Moves
 from case_record.procedures import Procedures
 from case_record.rows import Case
-from case_record.seals import Seals
+from case_record.seal_chain import Seals
 from case_record.slices import Slices
 
 __all__ = ["FILE_NAME", "CaseRecord", "CaseRecordError", "RecordUnavailableError"]

@@ -163,7 +163,7 @@ MIGRATIONS: tuple[str, ...] = (
     CREATE INDEX slice_by_seq ON slice (seq);
     CREATE INDEX event_by_kind ON event (kind, event_id);
     """,
-    # One chain of hashes over all rows (`seals`, which makes the triggers); no query without index.
+    # One chain of hashes over all rows (`seal_chain`); no query without an index.
     """
     CREATE TABLE seal (
         seal_id INTEGER PRIMARY KEY,

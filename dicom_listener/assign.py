@@ -25,7 +25,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from dicom_listener.belonging import Binding, why_not_of
-from dicom_listener.clock import Offset, OffsetUnknown
+from dicom_listener.clock_offset import Offset, OffsetUnknown
 from dicom_slice.geometry import SliceGeometry
 from dicom_slice.header import Slice
 from dicom_slice.reasons import Reason

@@ -27,10 +27,10 @@ from dicom_listener.assign import (
     assign,
 )
 from dicom_listener.case_gate import CaseGate
-from dicom_listener.clock import ClockRules, Comparison
-from dicom_listener.copies import what_it_is
+from dicom_listener.clock_offset import ClockRules, Comparison
 from dicom_listener.holding_area import INBOX, Arrival
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope
+from dicom_listener.known_uid import what_it_is
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.plans import PLAN_RECEIVED, plan_event
 from dicom_listener.scanner_clocks import CLOCK_DOUBTED, ScannerClocks

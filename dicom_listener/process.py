@@ -18,7 +18,7 @@ from case_record.holding import FOLDER as HOLDING
 from case_record.presence import Presence, Sole
 from case_record.record import CaseRecord, CaseRecordError
 from dicom_listener.assign import AssignRules
-from dicom_listener.clock import ClockRules, Comparison
+from dicom_listener.clock_offset import ClockRules, Comparison
 from dicom_listener.holding_area import INBOX
 from dicom_listener.inbox import Inbox
 from dicom_listener.intake import IntakeRules

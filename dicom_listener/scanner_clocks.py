@@ -5,7 +5,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from dicom_listener.clock import (
+from dicom_listener.clock_offset import (
     LAGS_KEPT,
     ClockRules,
     Comparison,

@@ -32,6 +32,7 @@ from room_config.shell import on_parent_gone
 from simulator.truth_client import TruthAddress, TruthError, ask_where
 
 Floats = NDArray[np.float64]
+Light = tuple[NDArray[np.float32], NDArray[np.float32]]
 _SUBSAMPLES = 4
 _RATE_HZ = 12.0
 _MOST_OLD_S = 0.4
@@ -108,7 +109,7 @@ class Scene:
     def __init__(self, camera: VirtualCamera, seed: int) -> None:
         self.camera = camera
         self._rng = np.random.default_rng(seed)
-        self._last: tuple[tuple[float, ...], Floats] = ((), np.empty(0))
+        self._last: tuple[tuple[float, ...], Light] | None = None
 
     @cached_property
     def _points(self) -> Floats:
@@ -131,11 +132,9 @@ class Scene:
     def picture(self, stage_mm: dict[str, float]) -> NDArray[np.uint8]:
         """(rows, cols, 3) RGB."""
         where = tuple(self.circle_mm(stage_mm).tolist())
-        seen, light = self._last
-        if where != seen:  # what stands still has new noise alone
-            light = self._light_at(np.array(where))
-            self._last = where, light
-        return self._noisy(light)
+        if self._last is None or self._last[0] != where:  # what stands still has new noise alone
+            self._last = where, self._with_spread(self._light_at(np.array(where)))
+        return self._noisy(self._last[1])
 
     def _light_at(self, circle_mm: Floats) -> Floats:
         """From each pixel's share of sheet and circle; near an edge its subsamples are asked."""
@@ -172,7 +171,7 @@ class Scene:
             mask.reshape(rows, n, cols, n).mean(axis=(1, 3), dtype=np.float64)
             for mask in (margin, black)
         )
-        return self._noisy(self._behind_lens(*shares))
+        return self._noisy(self._with_spread(self._behind_lens(*shares)))
 
     def _behind_lens(self, white: Floats, coloured: Floats) -> Floats:
         """(rows, cols, 3) light, from the share of each pixel."""
@@ -181,12 +180,19 @@ class Scene:
         stage, white_colour, red = (np.array(c) for c in (camera.stage, camera.white, camera.red))
         return np.asarray(stage + sheet * (white_colour - stage) + circle * (red - white_colour))
 
-    def _noisy(self, light: Floats) -> NDArray[np.uint8]:
-        """In noise and levels."""
+    def _with_spread(self, light: Floats) -> Light:
+        """Levels of the sensor without noise, and the standard deviation of its noise."""
         camera = self.camera
         spread = camera.noise_levels * np.sqrt(np.maximum(light, 0.02) / max(camera.white))
-        noisy = _FULL_SCALE * light + spread * self._rng.standard_normal(light.shape)
-        return np.clip(np.rint(noisy), 0, 255).astype(np.uint8)
+        return (_FULL_SCALE * light).astype(np.float32), spread.astype(np.float32)
+
+    def _noisy(self, light: Light) -> NDArray[np.uint8]:
+        """A picture of the stream: single precision is finer than the levels of a JPEG."""
+        levels, spread = light
+        noisy = self._rng.standard_normal(levels.shape, np.float32)
+        noisy *= spread
+        noisy += levels
+        return np.clip(np.rint(noisy, noisy), 0, 255, noisy).astype(np.uint8)
 
 
 def jpeg(picture: NDArray[np.uint8], quality: int) -> bytes:

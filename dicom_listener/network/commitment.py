@@ -28,6 +28,7 @@ _ALL_SAFE, _SOME_FAILED = 1, 2
 _NO_SUCH_INSTANCE, _CLASS_CONFLICT = 0x0112, 0x0119
 _NO_SUCH_ACTION, _INVALID = 0x0123, 0x0115
 _LOOK_AGAIN_S = 0.5
+_REPORT_AFTER_S = 0.1  # a console may still be busy with the answer to its request
 
 log = structlog.get_logger("listener")
 
@@ -147,6 +148,7 @@ class Commitment:
     def _report(self, who: str, asked: Dataset, tell: Callable[[int, Dataset], str]) -> None:
         try:
             event, report = self.report_on(asked)
+            time.sleep(_REPORT_AFTER_S)
             why_not = tell(event, report)
             if not why_not or (who in self.reports_to and self._on_a_new_one(who, event, report)):
                 return

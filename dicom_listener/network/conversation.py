@@ -73,7 +73,7 @@ def check_turn(kind: int, phase: Phase) -> None:
     elif phase is Phase.SILENT:
         raise BreachError("out_of_turn", f"{name} before any association request")
     elif kind in (ASSOCIATE_AC, ASSOCIATE_RJ, RELEASE_RP):
-        raise BreachError("out_of_turn", f"{name}, for which nobody had asked")
+        raise BreachError("out_of_turn", f"{name} without a request")
     elif phase is Phase.ASKED:
         raise BreachError("out_of_turn", f"{name} before the association was accepted")
     elif phase is Phase.RELEASING:
@@ -155,12 +155,12 @@ class Conversation:
             if self._command is not None:
                 name = self._command.name
                 raise BreachError(
-                    "out_of_turn", f"a command before the data set of {name} was whole"
+                    "out_of_turn", f"a command before the data set of {name} was complete"
                 )
             self._context = context
             self._command_bytes += data
             if len(self._command_bytes) > _LONGEST_COMMAND:
-                raise BreachError("unreadable", "a command that does not end")
+                raise BreachError("unreadable", "an unterminated command")
             if is_last:
                 self._command = self._whole_command(context)
         elif self._command is None:
@@ -198,7 +198,7 @@ def read_command(encoded: bytes, context: int) -> Command:
         group, number, size = struct.unpack("<HHL", head)
         end = at + 8 + size
         if group != 0 or end > len(encoded):
-            raise BreachError("unreadable", "a command that cannot be read")
+            raise BreachError("unreadable", "an unreadable command")
         values[number] = encoded[at + 8 : end]
         at = end
     field, data_set_type = values.get(_FIELD, b""), values.get(_DATA_SET_TYPE, b"")

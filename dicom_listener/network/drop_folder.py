@@ -162,7 +162,7 @@ class DropFolder:
             except OSError as error:  # locked by the console, or no room: it may go in a while
                 if name not in self._troubled:
                     self._troubled.add(name)
-                    text = f"{name}: {error.strerror or error}; it is tried again"
+                    text = f"{name}: {error.strerror or error}; will be retried"
                     self._alarm("watch_dir_refused", text)
                 return
         self._troubled.discard(name)
@@ -206,7 +206,7 @@ class DropFolder:
         descriptor = os.open(self._folder / name, os.O_RDONLY | os.O_NONBLOCK)
         with open(descriptor, "rb") as file:
             if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-                raise OSError(errno.EINVAL, "no regular file")
+                raise OSError(errno.EINVAL, "not a regular file")
             return file.read()
 
     def _alarm(self, kind: str, text: str) -> None:

@@ -36,7 +36,7 @@ def refusal_of(command: Command, accepted: Mapping[int, str]) -> Refusal | None:
     accepted: number of each accepted presentation context -> its abstract syntax.
     """
     if command.is_response:
-        return Refusal(f"{command.name} to nothing that was asked")
+        return Refusal(f"{command.name} without a request")
     abstract_syntax = accepted.get(command.context)
     if abstract_syntax is None:
         why = f"{command.name} on presentation context {command.context}, which was not accepted"
@@ -67,7 +67,7 @@ def _refused_store(command: Command, accepted: set[str]) -> Refusal | None:
     if not uid:
         return Refusal("a C-STORE without a SOP class")
     if not is_storage(uid):
-        why = f"a C-STORE of {uid.name[:64]}, which is no kind of object that is stored"
+        why = f"a C-STORE of {uid.name[:64]}, an object type that is not stored here"
         return Refusal(why, _CLASS_NOT_SUPPORTED)
     if uid not in accepted and uid_to_service_class(uid) is ServiceClass:
         why = f"a C-STORE of {uid.name[:64]}, which was not proposed"

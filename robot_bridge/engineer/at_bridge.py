@@ -135,7 +135,7 @@ def jog(args: argparse.Namespace, config: BridgeConfig) -> None:
         outcome = _while_armed(
             args, client, lambda: client.move(_command_id("jog"), setpoints_um, None)
         )
-    _report(args, outcome)
+        _report(args, outcome, client.status)
 
 
 def home(args: argparse.Namespace, config: BridgeConfig) -> None:
@@ -146,7 +146,7 @@ def home(args: argparse.Namespace, config: BridgeConfig) -> None:
         outcome = _while_armed(
             args, client, lambda: client.home(_command_id("home"), args.by, args.axes)
         )
-    _report(args, outcome)
+        _report(args, outcome, client.status)
 
 
 def _command_id(what: str) -> str:
@@ -169,12 +169,14 @@ def _while_armed(
             client.disarm(args.by)
 
 
-def _report(args: argparse.Namespace, outcome: MoveOutcome) -> None:
+def _report(args: argparse.Namespace, outcome: MoveOutcome, status: BridgeStatus) -> None:
     fields: dict[str, object] = {
         "state": outcome.state.value,
         "code": outcome.code,
         "text": outcome.text,
-        "readback_um": dict(outcome.readback_um),
+        "readback_um": _positions(
+            outcome.readback_um, status.certain_axes, status.remembered_um, status.bound_um
+        ),
     }
     show(args, fields)
     if not outcome.done:

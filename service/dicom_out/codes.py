@@ -32,9 +32,9 @@ PROCEDURE = codes.SCT.ImagingGuidance
 FIDUCIAL = own("fiducial", "Fiducial on the needle guide")
 
 CENTRE = (
-    own("centre-x", "Centre of the fiducial, patient x (to the left)"),
-    own("centre-y", "Centre of the fiducial, patient y (to the back)"),
-    own("centre-z", "Centre of the fiducial, patient z (to the head)"),
+    own("centre-x", "Centre of the fiducial, x (towards the patient's left)"),
+    own("centre-y", "Centre of the fiducial, y (towards the patient's back)"),
+    own("centre-z", "Centre of the fiducial, z (towards the patient's head)"),
 )
 CENTRE_ALONG = (
     own("centre-row", "Centre of the fiducial, down the rows"),

@@ -8,6 +8,7 @@ a process of its own (highdicom takes its time to load, and the control loop nee
 
 from __future__ import annotations
 
+import copy
 import io
 import os
 import re
@@ -101,7 +102,7 @@ def make_output(record: CaseRecord, output: Output) -> Path:
     if path.is_file() and record.is_sealed(name):
         return path
     try:
-        content = _encoded(_dataset(record, output))
+        content = encoded(_dataset(record, output))
     except OutputError:
         raise
     except KeyError as error:
@@ -115,19 +116,26 @@ def make_output(record: CaseRecord, output: Output) -> Path:
     return path
 
 
-def _encoded(dataset: Dataset) -> bytes:
+def encoded(dataset: Dataset) -> bytes:
     """In the slices' character set; where that lacks a letter, of the operator say, in UTF-8."""
-    for in_utf8 in (False, True):
-        if in_utf8:
-            dataset.decode()
-            dataset.SpecificCharacterSet = "ISO_IR 192"
-        buffer = io.BytesIO()
-        with warnings.catch_warnings(record=True) as said:
-            warnings.simplefilter("always")
-            dataset.save_as(buffer, enforce_file_format=True)
-        if not any("Failed to encode" in str(one.message) for one in said):
-            break
-    return buffer.getvalue()
+    # a name keeps the bytes of its first encoding, right or wrong: each try has names of its own
+    content, lacks_letters = _saved(copy.deepcopy(dataset))
+    if not lacks_letters:
+        return content
+    from service.dicom_out.source import in_other_charset
+
+    in_other_charset(dataset, "ISO_IR 192")
+    content, _ = _saved(dataset)
+    return content
+
+
+def _saved(dataset: Dataset) -> tuple[bytes, bool]:
+    """The file, and whether its character set lacks a letter."""
+    buffer = io.BytesIO()
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        dataset.save_as(buffer, enforce_file_format=True)
+    return buffer.getvalue(), any("Failed to encode" in str(one.message) for one in said)
 
 
 def _dataset(record: CaseRecord, output: Output) -> Dataset:

@@ -26,7 +26,7 @@ from service.dicom_out.outbox_store import (
     OutboxStore,
     cases_with_open_deliveries,
 )
-from service.room.alarms import Condition
+from service.room.alarm_list import Condition
 
 _LOOK_S = 0.5
 _RESTART_S = 1.0

@@ -68,7 +68,7 @@ def report_of(finding: ReportContent) -> Dataset:
         is_complete=True,
         is_final=False,
     )
-    stamp(made, finding, "report", f"AutoSPINe {subject} {number} (research, no medical device)")
+    stamp(made, finding, "report", f"AutoSPINe {subject} {number} (research, not a medical device)")
     made.CodingSchemeIdentificationSequence = DicomSequence([concept.scheme_identification()])
     return made
 

@@ -11,7 +11,6 @@ from typing import Any
 
 import pydicom
 from pydicom.dataset import Dataset
-from pydicom.multival import MultiValue
 from pydicom.sequence import Sequence as DicomSequence
 from pydicom.valuerep import format_number_as_ds
 
@@ -31,6 +30,11 @@ _EMPTY_IF_MISSING = (
     "ReferringPhysicianName",
 )
 _SEXES = ("M", "F", "O")
+# character sets that highdicom and pydicom both write; not 149 (Korean) and 58 (Chinese)
+_ONE_BYTE = (13, 100, 101, 109, 110, 126, 127, 138, 144, 148, 166)
+_ALONE = {"ISO_IR 192", "GB18030", *(f"ISO_IR {number}" for number in _ONE_BYTE)}
+_KANJI = {"ISO 2022 IR 87", "ISO 2022 IR 159"}
+_EXTENDED = {"ISO 2022 IR 6", *(f"ISO 2022 IR {number}" for number in _ONE_BYTE), *_KANJI}
 _SHARED, _EACH = "SharedFunctionalGroupsSequence", "PerFrameFunctionalGroupsSequence"
 _RESCALE = "PixelValueTransformationSequence"
 
@@ -51,19 +55,36 @@ def source_of(finding: ReportContent, index: int) -> Dataset:
 
 
 def tidy_patient(dataset: Dataset) -> None:
-    """Attributes that must be there are, if only empty; a sex that DICOM does not know is empty.
-
-    The default alphabet before others has its name: highdicom does not know it by being left out.
+    """Attributes that must be there are, if only empty; a sex that DICOM does not know is empty; a
+    character set that cannot be written, or is not said, becomes UTF-8.
     """
     for name in _EMPTY_IF_MISSING:
         if name not in dataset:
             setattr(dataset, name, None)
     if dataset.PatientSex not in _SEXES:
         dataset.PatientSex = None
-    alphabets = dataset.get("SpecificCharacterSet")
-    if isinstance(alphabets, MultiValue) and not alphabets[0]:
-        dataset.decode()
-        dataset.SpecificCharacterSet = ["ISO 2022 IR 6", *alphabets[1:]]
+    found = dataset.get("SpecificCharacterSet")
+    kept = _charset_kept([found] if isinstance(found, str) else list(found or ()))
+    if kept != found:
+        in_other_charset(dataset, kept)
+
+
+def in_other_charset(dataset: Dataset, charset: str | list[str]) -> None:
+    """What was read and not looked at yet is decoded first."""
+    for _ in dataset.iterall():
+        pass
+    dataset.SpecificCharacterSet = charset
+
+
+def _charset_kept(words: list[str]) -> str | list[str]:
+    """As declared, with the default alphabet before others by its name; or UTF-8."""
+    if len(words) == 1 and words[0] in _ALONE:
+        return words[0]
+    if len(words) > 1:
+        words[0] = words[0] or "ISO 2022 IR 6"
+        if _EXTENDED.issuperset(words) and words[0] not in _KANJI:
+            return words
+    return "ISO_IR 192"
 
 
 def frame_of_reference(dataset: Dataset) -> str:

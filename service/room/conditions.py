@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from robot_bridge.protocol.phases import WorkPhase
-from service.room.alarms import TO_DO, Condition
+from service.room.alarm_list import TO_DO, Condition
 from service.room.prompt import plain_words
 from service.room.state import RoomState
 

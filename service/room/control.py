@@ -33,7 +33,7 @@ from service.procedure.runner import ReplayMismatchError, run_procedure
 from service.procedure.scan_frame import frame_of
 from service.procedure.steps import Outcome, Step
 from service.procedure.targets import ENTRY_SET, TARGET_SET
-from service.room.alarms import Condition
+from service.room.alarm_list import Condition
 from service.room.cases.between import BetweenCases
 from service.room.cases.life import CaseLife, is_finished, set_at_rest
 from service.room.commands.commands import Commands

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from case_record.record import CaseRecord
-from case_record.seals import TamperedError
+from case_record.seal_chain import TamperedError
 from dicom_slice.pixels import magnitude_pixels
 from dicom_slice.reasons import Reason, UnusableError
 from sr_engine.residual import residual_image

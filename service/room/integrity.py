@@ -6,7 +6,7 @@ import structlog
 
 from case_record.record import CaseRecord
 from case_record.rows import SliceRow
-from case_record.seals import TamperedError
+from case_record.seal_chain import TamperedError
 from dicom_listener.inbox import NotFromInboxError, data_set_bytes, sha256_of
 
 log = structlog.get_logger()

@@ -14,7 +14,7 @@ from typing import Any
 
 from case_record.record import CaseRecord
 from case_record.rows import Event, Hold
-from dicom_listener.clock import ClockRules
+from dicom_listener.clock_offset import ClockRules
 from dicom_listener.scanner_clocks import (
     CLOCK_COMPARED,
     CLOCK_DOUBTED,
@@ -22,7 +22,7 @@ from dicom_listener.scanner_clocks import (
     outdates_until_s,
 )
 from room_config.load import Config
-from service.room.alarms import Condition
+from service.room.alarm_list import Condition
 from service.room.state import ClockState
 from service.room.validity import computer_start
 

@@ -18,7 +18,7 @@ from service.procedure.targets import (
     current_target,
     why_void_target,
 )
-from service.room.alarms import AlarmBook, Condition
+from service.room.alarm_list import AlarmBook, Condition
 from service.room.belief.describe import describe_belief
 from service.room.belief.goal import effective, goal_tolerance_mm
 from service.room.belief.state import BeliefState

@@ -13,7 +13,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from case_record.record import CaseRecord
-from service.room.alarms import Condition
+from service.room.alarm_list import Condition
 from service.room.refusal import ConflictError
 from service.room.state import AlarmState, LostState, MeasurementState, RobotState, RoomState
 

@@ -23,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from case_record.record import CaseRecord
-from case_record.seals import TamperedError
+from case_record.seal_chain import TamperedError
 from dicom_slice.geometry import SliceGeometry
 from room_config.service import GuideConfig
 from service.room.images import ImageMissingError, reconstruction_pixels, slice_pixels

@@ -15,7 +15,7 @@ import structlog
 
 from case_record.cases import Cases
 from case_record.record import CaseRecord, CaseRecordError
-from service.room.alarms import Condition
+from service.room.alarm_list import Condition
 from service.room.cases.life import is_finished
 from service.web.documents import Documents
 from service.web.problems import ProblemError

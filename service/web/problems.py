@@ -20,7 +20,7 @@ from starlette.exceptions import HTTPException
 
 from case_record.cases import CasesError, NoCaseError
 from case_record.record import CaseRecordError, RecordUnavailableError
-from case_record.seals import TamperedError
+from case_record.seal_chain import TamperedError
 from service.room.images import ImageMissingError
 from service.room.refusal import ConflictError
 

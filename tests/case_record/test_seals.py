@@ -9,8 +9,8 @@ import pytest
 from test_record import a_slice, begin_hold
 
 from case_record.record import FILE_NAME, CaseRecord, CaseRecordError
-from case_record.sealing import SEALED
-from case_record.seals import TamperedError
+from case_record.seal_chain import TamperedError
+from case_record.seal_triggers import SEALED
 
 
 @pytest.fixture(scope="module")

@@ -19,7 +19,7 @@ from dicom_listener.assign import (
     Quarantined,
     assign,
 )
-from dicom_listener.clock import OffsetBounds, OffsetUnknown
+from dicom_listener.clock_offset import OffsetBounds, OffsetUnknown
 from dicom_listener.promptness import Promptness, Witness
 from dicom_slice.reasons import Reason
 from dicom_slice.times import AcquisitionInterval

@@ -14,7 +14,7 @@ from dicom_listener.belonging import (
     event_body,
     why_not_of,
 )
-from dicom_listener.clock import OffsetBounds
+from dicom_listener.clock_offset import OffsetBounds
 from dicom_listener.slice_rows import header_for_record, slice_from_record
 from dicom_slice.header import slices_of
 from dicom_slice.reasons import Reason

@@ -16,7 +16,7 @@ from pydicom.dataelem import DataElement
 from pydicom.dataset import Dataset
 from pydicom.sequence import Sequence
 
-from dicom_listener.clock import (
+from dicom_listener.clock_offset import (
     ClockRules,
     Comparison,
     OffsetBounds,

@@ -8,7 +8,7 @@ from made_slices import a_slice
 from test_assignment import any_trouble
 from virtual_day import VirtualDay
 
-from dicom_listener.clock import Comparison
+from dicom_listener.clock_offset import Comparison
 from dicom_slice.times import AcquisitionInterval
 from service.commissioning.clocks import find_clock
 from service.commissioning.evidence import Press, Reception, one_series

@@ -3,7 +3,7 @@
 from made_slices import a_slice
 
 from dicom_listener.assign import Assigned, AssignRules, HoldWindow, Known, Quarantined, assign
-from dicom_listener.clock import OffsetBounds
+from dicom_listener.clock_offset import OffsetBounds
 from dicom_slice.eligibility import SliceRules, why_not_usable
 from dicom_slice.reasons import Reason
 

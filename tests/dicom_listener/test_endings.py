@@ -207,8 +207,8 @@ TWO_PARTS = struct.pack(">LBB", len(command(0x30)) + 2, 1, 3) + command(0x30)
         ),
         (p_data(1, store_command("1.2.3")[:30]) + RELEASE, "unfinished", "released, in the middle"),
         (p_data(3, command(0x7777)), "not_offered", "an unknown command (0x7777), which is not of"),
-        (p_data(3, command(0x8001)), "not_offered", "a C-STORE response to nothing that was ask"),
-        (p_data(3, command(0x8100)), "not_offered", "an N-EVENT-REPORT response to nothing that"),
+        (p_data(3, command(0x8001)), "not_offered", "a C-STORE response without a request"),
+        (p_data(3, command(0x8100)), "not_offered", "an N-EVENT-REPORT response without a req"),
         (
             p_data(3, store_command("1.2.3"), 5) + p_data(2, DATA_SET, 5),
             "not_offered",
@@ -224,7 +224,7 @@ TWO_PARTS = struct.pack(">LBB", len(command(0x30)) + 2, 1, 3) + command(0x30)
         (
             p_data(3, store_command("1.2.3")) + p_data(3, store_command("1.2.4")),
             "out_of_turn",
-            "a command before the data set of a C-STORE was whole, in the middle of a message (",
+            "a command before the data set of a C-STORE was complete, in the middle of a message (",
         ),
         (
             p_data(3, store_command("1.2.3")) + p_data(2, DATA_SET, 3),
@@ -238,8 +238,8 @@ TWO_PARTS = struct.pack(">LBB", len(command(0x30)) + 2, 1, 3) + command(0x30)
             "out_of_turn",
             "a second association request, in the middle of a message (112 bytes",
         ),
-        (pdu(2), "out_of_turn", "an acceptance of an association, for which nobody had asked"),
-        (pdu(6), "out_of_turn", "an answer to a release, for which nobody had asked"),
+        (pdu(2), "out_of_turn", "an acceptance of an association without a request"),
+        (pdu(6), "out_of_turn", "an answer to a release without a request"),
         (pdu(9), "unreadable", "an unknown kind of PDU (0x09)"),
         (pdu(4, b""), "unreadable", "a PDU for a message with nothing in it"),
         (
@@ -247,8 +247,8 @@ TWO_PARTS = struct.pack(">LBB", len(command(0x30)) + 2, 1, 3) + command(0x30)
             "unreadable",
             "a part of a message that does not fit its PDU",
         ),
-        (p_data(3, b"\xff" * 40), "unreadable", "a command that cannot be read"),
-        (p_data(3, command(1)[:20]), "unreadable", "a command that cannot be read"),
+        (p_data(3, b"\xff" * 40), "unreadable", "an unreadable command"),
+        (p_data(3, command(1)[:20]), "unreadable", "an unreadable command"),
         (p_data(3, b""), "unreadable", "a command that does not say what it is"),
         (
             p_data(3, command(1, has_data=True).replace(b"\x10\1\2", b"\x20\1\2"))

@@ -15,7 +15,7 @@ from real_slices import DICOM
 
 from case_record.cases import Cases
 from case_record.record import CaseRecord
-from dicom_listener.clock import ClockRules, Comparison
+from dicom_listener.clock_offset import ClockRules, Comparison
 from dicom_listener.inbox import Envelope, Inbox, NotFromInboxError, read_envelope, sha256_of
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics

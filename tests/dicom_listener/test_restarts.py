@@ -14,7 +14,7 @@ from made_slices import begin_hold, mr_data_set
 from pydicom.dataset import Dataset
 
 from case_record.record import CaseRecord
-from dicom_listener.clock import ClockRules
+from dicom_listener.clock_offset import ClockRules
 from dicom_listener.inbox import Envelope, Inbox, sha256_of
 from dicom_listener.intake import Intake, IntakeRules
 from dicom_listener.metrics import ListenerMetrics

@@ -86,7 +86,7 @@ def alarms(server: Serving) -> list[tuple[str, str]]:
         (
             p_data(3, command(1, sop_class=WORKLIST, has_data=True)) + p_data(2, DATA_SET),
             0x0122,
-            "a C-STORE of Modality Worklist Information Model - FIND, which is no kind of object",
+            "a C-STORE of Modality Worklist Information Model - FIND, an object type that",
         ),
         (
             p_data(3, command(1, sop_class="1.2.3.4", has_data=True)) + p_data(2, DATA_SET),
@@ -159,9 +159,10 @@ def test_slices_that_come_before_the_answer_to_a_report_are_stored(tmp_path):
 
 def test_a_console_that_stores_while_it_takes_its_report_is_not_aborted(tmp_path):
     """pynetdicom's own sender, which answers a report in a thread beside."""
-    reported, may_answer = threading.Event(), threading.Event()
+    reported, may_answer, answering = threading.Event(), threading.Event(), []
 
     def on_report(event: evt.Event) -> tuple[int, None]:
+        answering.append(threading.current_thread())
         reported.set()
         may_answer.wait(60)
         return 0x0000, None
@@ -180,6 +181,7 @@ def test_a_console_that_stores_while_it_takes_its_report_is_not_aborted(tmp_path
         for number in range(20):
             assert association.send_c_store(mr_data_set(f"1.2.{number + 1}")).Status == 0
         may_answer.set()
+        answering[0].join()  # until then pynetdicom may say that nothing is paused
         assert association.send_c_store(mr_data_set("1.2.99")).Status == 0
         association.release()
         wait_for(lambda: server.count("association_endings_total", ending="released") == 1)

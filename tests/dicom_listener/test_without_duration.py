@@ -8,7 +8,7 @@ from made_slices import begin_hold, mr_data_set
 from real_slices import DICOM, manifest
 from test_intake import Desk
 
-from dicom_listener.clock import Comparison
+from dicom_listener.clock_offset import Comparison
 from dicom_slice.eligibility import SliceRules, why_not_usable
 from dicom_slice.header import read_header
 from dicom_slice.reasons import UnusableError

@@ -16,7 +16,7 @@ from dataclasses import dataclass, field, replace
 from made_slices import CORONAL, a_slice
 
 from dicom_listener.assign import Assigned, AssignRules, HoldWindow, Known, assign
-from dicom_listener.clock import (
+from dicom_listener.clock_offset import (
     ClockRules,
     Comparison,
     Offset,

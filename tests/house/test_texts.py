@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from service.room.alarms import TO_DO
+from service.room.alarm_list import TO_DO
 
 ROOT = Path(__file__).parents[2]
 # a word that was given up in favour of another one, and that one
@@ -44,7 +44,7 @@ def test_every_kind_of_text_is_in_the_list(texts):
             "service/room/prompt.py",
             "Stopped ({plain_words(status.stop_reason)}). Re-arm to continue.",
         ),
-        ("service/room/alarms.py", "Send or acquire the slice again."),
+        ("service/room/alarm_list.py", "Send or acquire the slice again."),
         ("service/page/texts.js", "Needle withdrawn – unlock motion"),
         ("service/page/index.html", "Emergency: stop and park the drives"),
         ("room_config/listener.py", "Largest object that is stored."),

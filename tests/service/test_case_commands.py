@@ -14,7 +14,7 @@ import pytest
 from offline_arguments import approach_arguments, beside, calibration_arguments
 
 from case_record.record import FILE_NAME, CaseRecord
-from case_record.sealing import prepare
+from case_record.seal_triggers import prepare
 from case_record.sql import MIGRATIONS
 from service.cli.replay import replay_measurements
 from service.procedure.observe import ProcedureFailedError

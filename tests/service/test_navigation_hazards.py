@@ -13,7 +13,7 @@ import pytest
 from offline_arguments import approach_arguments, beside, calibration_arguments
 
 from case_record.record import CaseRecord
-from case_record.sealing import prepare
+from case_record.seal_triggers import prepare
 from service.procedure.approach import approach
 from service.procedure.calibration import calibrate
 from service.procedure.observe import ABORT, RESCAN, ProcedureFailedError

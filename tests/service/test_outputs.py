@@ -1,5 +1,6 @@
 """DICOM outputs say what the record says, are what the standard asks for, and are made once."""
 
+import io
 import shutil
 import subprocess
 import sys
@@ -12,13 +13,14 @@ import numpy as np
 import pydicom
 import pytest
 from highdicom.sr import Comprehensive3DSR
-from pydicom.dataset import Dataset
+from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.sr.codedict import codes
+from pydicom.uid import ExplicitVRLittleEndian
 from receivers import needs_program
 from recorded_case import OFFSET_MM, TOLERANCE_MM, come_to_ready, make_case, puncture
 
 from case_record.record import CaseRecord, CaseRecordError
-from case_record.seals import TamperedError
+from case_record.seal_chain import TamperedError
 from service.cli.export import write_export
 from service.dicom_out.codes import CENTRE, CENTRE_ALONG, DEPTH, DISTANCE, PROBABILITY, TOLERANCE
 from service.dicom_out.content import finding_of_arrival, finding_of_measurement
@@ -26,6 +28,7 @@ from service.dicom_out.errors import OutputError
 from service.dicom_out.make import (
     Output,
     dataset_of,
+    encoded,
     make_output,
     output_of,
     outputs_to_send,
@@ -335,6 +338,13 @@ def suzukis(tmp_path_factory: pytest.TempPathFactory) -> Path:
         ("ISO_IR 192", "Yamada^Tarou=山田^太郎=やまだ^たろう"),
         ("ISO_IR 100", "Müller^Jörg"),
         (None, "Miller^George"),
+        ("ISO_IR 6", "Miller^George"),
+        ("", "Miller^George"),
+        (None, "Müller^Jörg"),
+        ("ISO 2022 IR 100", "Müller^Jörg"),
+        (["ISO_IR 13", "ISO 2022 IR 87"], "ﾔﾏﾀﾞ^ﾀﾛｳ=山田^太郎"),
+        (["", "ISO 2022 IR 149"], "Hong^Gildong=洪^吉洞=홍^길동"),
+        ("GB18030", "Wang^XiaoDong=王^小东"),
     ],
 )
 def test_names_are_written_as_they_are_whatever_the_alphabet(suzukis, tmp_path, charset, name):
@@ -362,6 +372,25 @@ def test_names_are_written_as_they_are_whatever_the_alphabet(suzukis, tmp_path, 
                 said = subprocess.run(["dciodvfy", path], capture_output=True, text=True).stderr
                 assert "haracter" not in said.replace("99AUTOSPINE", ""), said
         assert any("鈴木 花子" in item.get("TextValue", "") for item in group_of(read))
+
+
+def test_names_that_were_set_as_text_are_written_as_they_are_too():
+    """pydicom's own keep the bytes of their first encoding."""
+    meta = FileMetaDataset()
+    meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID = (
+        "1.2.840.10008.5.1.4.1.1.4",
+        "1.2",
+    )
+    meta.TransferSyntaxUID = ExplicitVRLittleEndian
+    dataset = FileDataset("", {}, file_meta=meta, preamble=bytes(128))
+    dataset.SOPClassUID = meta.MediaStorageSOPClassUID
+    dataset.SOPInstanceUID = meta.MediaStorageSOPInstanceUID
+    dataset.SpecificCharacterSet = "ISO_IR 144"
+    names = {"PatientName": "Иванов^Иван", "OperatorsName": "鈴木^花子"}
+    for keyword, name in names.items():
+        setattr(dataset, keyword, name)
+    read = pydicom.dcmread(io.BytesIO(encoded(dataset)))
+    assert {keyword: str(read[keyword].value) for keyword in names} == names
 
 
 def test_all_uids_are_different_and_only_reports_have_a_series_of_their_own(record):

@@ -9,7 +9,7 @@ import structlog
 
 from case_record.cases import Cases
 from room_config.load import Config
-from service.room.alarms import Condition
+from service.room.alarm_list import Condition
 from service.room.cases.held import HeldSlices
 from service.room.cases.life import begin, reopen
 from service.room.refusal import ConflictError

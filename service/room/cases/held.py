@@ -12,7 +12,7 @@ from case_record.record import CaseRecord, CaseRecordError
 from dicom_listener.belonging import ACCEPTED, Binding
 from dicom_listener.case_gate import recorded_binding
 from dicom_slice.reasons import Reason
-from service.room.alarms import Condition
+from service.room.alarm_list import Condition
 from service.room.state import HeldState
 
 _SHOWN_S = 600.0

@@ -16,7 +16,7 @@ from typing import Any
 
 from case_record.connection import CaseRecordError
 from case_record.events import Events
-from case_record.sealing import FIRST, SEALED, next_seal, row_digest
+from case_record.seal_triggers import FIRST, SEALED, next_seal, row_digest
 
 FILE_SEALED = "file_sealed"
 

@@ -1,4 +1,4 @@
-"""How rows are sealed: the triggers, and the two functions that they call; see `seals`."""
+"""How rows are sealed: the triggers, and the two functions that they call; see `seal_chain`."""
 
 from __future__ import annotations
 
