@@ -5,6 +5,7 @@ nobody can tell is no plan, and the reason is noted in its place.
 """
 
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -63,15 +64,26 @@ def _places(record: CaseRecord, plan: PlanObject) -> dict[str, Any]:
             frames.add(frame)
     if len(frames) > 1:
         return {"why": "its points are given in two frames of reference"}
-    return {**places, "frame_of_reference_uid": frames.pop()}
+    places["frame_of_reference_uid"] = frame = frames.pop()
+    if not frame:  # then when its images came has to tell whether the table has moved since
+        places["slice_ids"] = [row.slice_id for row in _slices_named(record, plan.points)]
+    return places
+
+
+def _slices_named(record: CaseRecord, points: Sequence[PlanPoint]) -> list[SliceRow]:
+    on_images = {point.on_image.sop_instance_uid for point in points if point.on_image}
+    uids = on_images.union(*(point.images for point in points))
+    return [row for uid in sorted(uids) for row in record.slices(sop_instance_uid=uid)]
 
 
 def _placed(same: list[PlanPoint]) -> list[PlanPoint]:
-    """Those that are points; what is drawn besides under the same label does not matter then."""
+    """Those that are points, or else circles; what is drawn besides under the same label does not
+    matter then.
+    """
     placed = [point for point in same if not point.why]
     if same and not placed:
         raise _NoPlaceError(same[0].why)
-    return placed
+    return [point for point in placed if not point.is_circle] or placed
 
 
 def _in_patient(record: CaseRecord, point: PlanPoint) -> Place:

@@ -2,14 +2,17 @@
 (TID 1500) or a Spatial Fiducials object.
 
 Points are taken by label, TARGET or ENTRY (also "target point", "Target 1"), never by their order.
-A point is given in patient mm (LPS) of a frame of reference, or on an image that it names. What has
-a label and is no such point is kept with the reason, so that nobody waits for it in vain.
+A point is given in patient mm (LPS) of a frame of reference, or on an image that it names; a circle
+on an image means its centre. What has a label and is no such point is kept with the reason, so that
+nobody waits for it in vain.
 """
+
+from __future__ import annotations
 
 import math
 import re
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -51,6 +54,7 @@ class OnImage:
 class PlanPoint:
     """label: TARGET or ENTRY; patient_mm with its frame of reference, or else on_image, or else why
     it has no place. images: without a frame of reference, the UIDs of those whose it is.
+    is_circle: it is the centre of a circle that somebody drew.
     """
 
     label: str
@@ -58,6 +62,7 @@ class PlanPoint:
     frame_of_reference_uid: str = ""
     on_image: OnImage | None = None
     images: tuple[str, ...] = ()
+    is_circle: bool = False
     why: str = ""
 
 
@@ -143,7 +148,6 @@ def _of_fiducial(
 
 
 def _of_presentation(data_set: Dataset) -> Iterator[PlanPoint]:
-    """A POINT in a layer of that name, or beside one text of that word; or the text's anchor."""
     everywhere = [
         image
         for series in data_set.get("ReferencedSeriesSequence") or ()
@@ -151,50 +155,77 @@ def _of_presentation(data_set: Dataset) -> Iterator[PlanPoint]:
     ]
     for annotation in data_set.get("GraphicAnnotationSequence") or ():
         images = annotation.get("ReferencedImageSequence") or everywhere
-        texts = [
-            (label, text)
-            for text in annotation.get("TextObjectSequence") or ()
-            if (label := label_of(text.get("UnformattedTextValue")))
-        ]
-        beside = {label for label, _ in texts}
-        layer = label_of(annotation.get("GraphicLayer"))
-        drawn = layer or (beside.pop() if len(beside) == 1 else "")
+        for label, mark in _named(annotation):
+            yield PlanPoint(label, why=mark) if isinstance(mark, str) else mark.on(label, images)
+
+
+@dataclass(frozen=True)
+class _Mark:
+    """A POINT, a CIRCLE around what is meant, or a text's anchor: (column, row) in its units."""
+
+    at: Sequence[float]
+    units: Any
+    radius: float = 0.0
+    is_circle: bool = False
+
+    @classmethod
+    def of_graphic(cls, item: Dataset) -> _Mark:
+        at = [float(value) for value in item.GraphicData]
+        units = item.get("GraphicAnnotationUnits")
+        if item.GraphicType == "CIRCLE":
+            return cls(at[:2], units, math.dist(at[:2], at[2:]), is_circle=True)
+        return cls(at, units)
+
+    def is_at(self, anchor: _Mark) -> bool:
+        beside = math.dist(self.at, anchor.at) <= self.radius + _BESIDE_PX
+        return self.units == anchor.units and beside
+
+    def on(self, label: str, images: Sequence[Dataset]) -> PlanPoint:
+        if self.units == "PIXEL":
+            return replace(_on(label, images, self.at), is_circle=self.is_circle)
+        why = f"is given in {self.units} units: draw it on the image, in PIXEL units"
+        return PlanPoint(label, why=why)
+
+
+def _named(annotation: Dataset) -> Iterator[tuple[str, _Mark | str]]:
+    """What has a label, or why it is none: a point, or else a circle, in a layer of that name or at
+    the text's anchor; the only ones beside a text without an anchor; an anchor of nothing else.
+    """
+    layer = label_of(annotation.get("GraphicLayer"))
+    texts = [
+        (label, text)
+        for text in annotation.get("TextObjectSequence") or ()
+        if (label := label_of(text.get("UnformattedTextValue")))
+    ]
+    labels = {label for label in (layer, *(label for label, _ in texts)) if label}
+    graphics: Sequence[Dataset] = ()
+    if labels:
         graphics = annotation.get("GraphicObjectSequence") or ()
-        points = [item for item in graphics if item.get("GraphicType") == "POINT"]
-        elsewhere = not layer and any(_is_elsewhere(text, points) for _, text in texts)
-        for item in points if drawn and not elsewhere else ():
-            yield _drawn(drawn, images, item.GraphicData, item.get("GraphicAnnotationUnits"))
-        if drawn and points and elsewhere:
-            yield PlanPoint(drawn, why="has its text at one place and a point at another")
-        if layer and graphics and not points:
-            yield PlanPoint(layer, why=f"is a {graphics[0].get('GraphicType')}, not a POINT")
-        for label, text in texts:
-            if label == drawn and points:
-                continue  # it says what the point beside it is
-            at, units = text.get("AnchorPoint"), text.get("AnchorPointAnnotationUnits")
-            if at:
-                yield _drawn(label, images, at, units)
-            else:
-                yield PlanPoint(label, why="is a text that points at nothing")
+    drawn = [item for item in graphics if item.get("GraphicType") in ("POINT", "CIRCLE")]
+    marks = [_Mark.of_graphic(item) for item in drawn]
+    if layer:
+        yield from ((layer, mark) for mark in _points_first(marks))
+    if layer and graphics and not marks:
+        yield layer, f"is a {graphics[0].get('GraphicType')}, not a POINT or a CIRCLE"
+    for label, text in texts:
+        if label == layer and marks:
+            continue  # it says what the layer says
+        if not text.get("AnchorPoint"):
+            yield from ((label, mark) for mark in _points_first(marks) if len(labels) == 1)
+            if not marks or len(labels) > 1:
+                yield label, "is a text that points at nothing"
+            continue
+        units = text.get("AnchorPointAnnotationUnits")
+        anchor = _Mark([float(value) for value in text.AnchorPoint], units)
+        meant = [mark for mark in marks if mark.is_at(anchor)] if graphics else [anchor]
+        yield from ((label, mark) for mark in _points_first(meant))
+        if not meant:
+            kind = (drawn or graphics)[0].get("GraphicType")
+            yield label, f"has its text at one place and a {kind} at another"
 
 
-def _is_elsewhere(text: Dataset, points: Sequence[Dataset]) -> bool:
-    """Whether a text is anchored at none of the points: a viewer may put all into one item."""
-    at = text.get("AnchorPoint")
-    if not at or not points:
-        return False
-    units = text.get("AnchorPointAnnotationUnits")
-    return not any(
-        item.get("GraphicAnnotationUnits") == units
-        and math.dist(map(float, at), map(float, item.GraphicData)) <= _BESIDE_PX
-        for item in points
-    )
-
-
-def _drawn(label: str, images: Sequence[Dataset], at: Any, units: Any) -> PlanPoint:
-    if units == "PIXEL":
-        return _on(label, images, at)
-    return PlanPoint(label, why=f"is given in {units} units: draw it on the image, in PIXEL units")
+def _points_first(marks: list[_Mark]) -> list[_Mark]:
+    return [mark for mark in marks if not mark.is_circle] or marks
 
 
 # Measurement reports
@@ -255,6 +286,8 @@ class _Report:
         kind, data = item.get("GraphicType"), item.get("GraphicData") or ()
         images = [one.ReferencedSOPSequence[0] for one in inner if one.get("ReferencedSOPSequence")]
         in_space = item.ValueType == "SCOORD3D"
+        if kind == "CIRCLE" and len(data) == 4 and not in_space:
+            return replace(_on(label, images, data[:2]), is_circle=True)
         if kind not in ("POINT", "MULTIPOINT") or len(data) != (3 if in_space else 2):
             return PlanPoint(label, why=f"is a {kind} of {len(data)} coordinates, not one point")
         if not in_space:

@@ -39,7 +39,7 @@ checks the table itself. Travel limits deliberately have no default.
 | `state_dir` | required | Folder of the journal, relative to the file; must survive a restart. |
 | `status_file` | `state_dir`/bridge_status.json | Health, rewritten as the bridge runs. |
 | `heartbeat_s`, `deadman_s` | 0.2, 1.0 | Silence from the service for longer than the deadman stops all motion. |
-| `motion_timeout_s` | 60 | A motion that lasts longer is stopped. |
+| `motion_timeout_s` | 120 | A motion that lasts longer is stopped; `check-config` says if homing needs more. |
 | `motion_poll_s` | 0.02 | How often the controllers are polled during a motion. |
 | `controller_baud`, `controller_timeout_s` | 115200, 0.1 | The line to the controllers. |
 | `controller_response_delay_us` | 20 | Their pause before a response; longer behind a fibre converter. |

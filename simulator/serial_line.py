@@ -7,11 +7,13 @@ time; as a process: `python -m simulator.serial_line --near PATH --far PATH [--l
 """
 
 import argparse
+import contextlib
 import heapq
 import json
 import os
 import random
 import select
+import signal
 import sys
 import threading
 import time
@@ -162,9 +164,13 @@ class NullModem:
             self._masters.append(master)
             self._slaves.append(slave)  # held open, so that either side may come and go
         self.near, self.far = (os.ttyname(slave) for slave in self._slaves)
-        for link, name in ((near_link, self.near), (far_link, self.far)):
-            if link is not None:
-                _point(link, name)
+        self._links = {
+            link: name
+            for link, name in ((near_link, self.near), (far_link, self.far))
+            if link is not None
+        }
+        for link, name in self._links.items():
+            _point(link, name)
         byte_s = 10 / baud
         self.directions = [
             FaultyDirection(faults, random.Random(f"{seed}:{index}"), byte_s) for index in range(2)
@@ -220,6 +226,10 @@ class NullModem:
         os.write(self._wake_write, b"x")
         if self._thread is not None:
             self._thread.join()
+        for link, name in self._links.items():
+            with contextlib.suppress(OSError):  # another line may have taken it over
+                if os.readlink(link) == name:
+                    link.unlink()
         for descriptor in (*self._masters, *self._slaves, self._wake_read, self._wake_write):
             os.close(descriptor)
 
@@ -265,11 +275,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     if args.exit_with_parent:
         threading.Thread(target=_end_with_parent, daemon=True).start()
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
     print(json.dumps({"ready": True, "near": str(args.near), "far": str(args.far)}), flush=True)
-    try:
+    with contextlib.closing(modem), contextlib.suppress(KeyboardInterrupt):
         modem.serve()
-    except KeyboardInterrupt:
-        return 0
     return 0
 
 

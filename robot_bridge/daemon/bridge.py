@@ -4,8 +4,8 @@ Bytes go in by `receive`, come out by `take_output`, and `tick` does what is due
 calls them. A motion begins only in `tick`, after everything that was received has been looked at,
 so a STOP that came with or after a MOVE is known before a motor turns.
 
-The parts: `permission` (phase, arming, latched stop), `motion_in_flight`, `bridge_journal`,
-`motor_watch`; `bridge_requests` answers requests from them, `bridge_view` tells how they stand.
+The parts: `permission` (phase, arming, latched stop), `motion_in_flight`, `declaring`,
+`bridge_journal`, `motor_watch`; `requests` answers from them, `bridge_view` tells how they stand.
 """
 
 from collections import Counter
@@ -17,6 +17,7 @@ from robot_bridge.daemon.arming import Arming
 from robot_bridge.daemon.bridge_journal import BridgeJournal
 from robot_bridge.daemon.bridge_settings import BridgeSettings
 from robot_bridge.daemon.bridge_view import BridgeView
+from robot_bridge.daemon.declaring import Declaring
 from robot_bridge.daemon.journal import Journal
 from robot_bridge.daemon.motion import Ending
 from robot_bridge.daemon.motion_in_flight import MotionInFlight
@@ -67,13 +68,16 @@ class Bridge:
             boot_id=boot_id, timeout_s=settings.motion_timeout_s,
             whereabouts=self._whereabouts(settings, journal), stop_for=self.stop_for,
         )  # fmt: skip
+        self._declaring = Declaring(self._motion, self.motors, self._journal, clock)
+        self._declared_for = 0  # the request's sequence number
         self._view = BridgeView(
             settings, boot_id, self._permission, self._motion, self.motors, self._journal,
-            self.end.counters, self.refused, self._now_ms,
+            self._declaring, self.end.counters, self.refused, self._now_ms,
         )  # fmt: skip
         self._requests = Requests(
-            self._view, self._permission, self._motion, self.motors, self._journal, self.refused
-        )
+            self._view, self._permission, self._motion, self.motors, self._journal,
+            self._declaring, self.refused,
+        )  # fmt: skip
         self._journal.close_old_commands()
         self._journal.tie_boards(self.motors.status.boards)
 
@@ -153,10 +157,14 @@ class Bridge:
                     self._freshen(event.heartbeat.seen_ms)
                     self.end.send_status(event.sequence, self.status())
                 case MalformedReceived():
-                    answer = self._requests.refuse(Code.MALFORMED, event.text)
-                    self.end.answer(event.sequence, answer)
+                    refused = self._requests.refuse(Code.MALFORMED, event.text)
+                    self.end.answer(event.sequence, refused)
                 case RequestReceived():
-                    self.end.answer(event.sequence, self._answer(event.request))
+                    answer = self._answer(event.request)
+                    if answer is None:
+                        self._declared_for = event.sequence
+                    else:
+                        self.end.answer(event.sequence, answer)
 
     def _receive_stop(self, stop: StopReceived) -> None:
         known = self.stopped and stop.nonce == self._last_stop_nonce
@@ -174,6 +182,7 @@ class Bridge:
     def _open_session(self, event: SessionOpened) -> None:
         text = "another session was opened"
         self._motion.stop(Ending(CommandState.STOPPED, Code.SESSION_ENDED, text))
+        self._declaring.give_up()
         self._permission.armed = False
         self._fresh_s = self._clock()
         self.end.open_session(event, self._hello(event.request.nonce))
@@ -182,7 +191,7 @@ class Bridge:
     def _hello(self, nonce: int) -> Callable[[int], Hello]:
         return lambda session: self._view.hello(nonce, session)
 
-    def _answer(self, request: Message) -> Answer:
+    def _answer(self, request: Message) -> Answer | None:
         seen_ms = getattr(request, "seen_ms", None)
         if seen_ms is not None:
             self._freshen(seen_ms)
@@ -206,7 +215,14 @@ class Bridge:
                 text = f"nothing heard from the service for {now_s - self._fresh_s:.2f} s"
                 self.stop_for(Code.LINK_LOST, text)
         self._motion.begin_if_due()
+        if self._declaring.under_way and not self._declaring.just_begun:
+            self._answer_late(self._requests.go_on_declaring())
+        self._declaring.just_begun = False
         self._follow_motors(now_s)
+
+    def _answer_late(self, answer: Answer | None) -> None:
+        if answer is not None:
+            self.end.keep_answer(self._declared_for, answer)
 
     def _follow_motors(self, now_s: float) -> None:
         status = self.motors.status
@@ -249,6 +265,8 @@ class Bridge:
 
     def _latch(self, code: Code, text: str, *, emergency: bool = False) -> None:
         self._motion.decide_end(Ending(CommandState.STOPPED, code, text))
+        if self._declaring.under_way:
+            self._answer_late(self._requests.give_up_declaring())
         stop = self._permission.latch(code, emergency=emergency)
         if stop.emergency:
             self._motion.note_parking()

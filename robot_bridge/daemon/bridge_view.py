@@ -8,6 +8,7 @@ from robot_bridge.daemon import rules
 from robot_bridge.daemon.arming import Arming
 from robot_bridge.daemon.bridge_journal import BridgeJournal
 from robot_bridge.daemon.bridge_settings import BridgeSettings
+from robot_bridge.daemon.declaring import Declaring
 from robot_bridge.daemon.motion_in_flight import MotionInFlight
 from robot_bridge.daemon.motor_watch import MotorWatch
 from robot_bridge.daemon.whereabouts import Stand
@@ -30,6 +31,7 @@ class BridgeView:
     motion: MotionInFlight
     motors: MotorWatch
     journal: BridgeJournal
+    declaring: Declaring
     frames: FrameCounters
     refused: Counter[str]
     now_ms: Callable[[], int]  # since the bridge began
@@ -48,7 +50,7 @@ class BridgeView:
             stop_reason=permission.stop_reason,
             stop_count=permission.stop_count,
             insertion_locked=self.journal.insertion_locked,
-            in_flight=command.command_id if command else None,
+            in_flight=command.command_id if command else self._declaration,
             certain_axes=self.motion.certain_axes,
             readback_um=dict(self.motors.status.readback_um),
             whereabouts=self.motion.whereabouts,
@@ -61,6 +63,10 @@ class BridgeView:
             stale_after_ms=self.stale_after_ms,
             axes=self.settings.axes,
         )
+
+    @property
+    def _declaration(self) -> str | None:
+        return "declare" if self.declaring.under_way else None
 
     def status(self) -> Status:
         permission, motors, command = self.permission, self.motors.status, self.motion.last_command

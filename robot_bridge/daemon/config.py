@@ -7,6 +7,7 @@ micrometres in the program.
 
 import math
 import tomllib
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,7 +18,12 @@ from robot_bridge.protocol.messages import NAME_MAX, AxisTravel
 TRAVEL_MAX_MM = 1000.0
 DRIVES = ("open_loop", "closed_loop")
 HOMING_OVERTRAVEL = 1.2  # of the travel: as far as the search for a mechanical end may go
-HOMING_EXTRA_S = 5.0  # unparking, backing off, slow adapters
+HOMING_CHUNK_UM = 2000.0  # of a run towards a mechanical end, between two looks at the encoder
+HOMING_EXTRA_S = 5.0  # unparking, backing off
+HOMING_RESERVE = 1.2  # steps may be shorter than set
+# What homing asks its board, at a slow adapter's pace; the axes of a bus take turns.
+ANSWER_S = 0.035
+HOMING_ANSWERS, CHUNK_ANSWERS = 50, 8
 
 
 class ConfigError(ValueError):
@@ -71,13 +77,18 @@ class AxisConfig:
     def travel(self) -> AxisTravel:
         return AxisTravel(self.name, self.travel_min_um, self.travel_max_um, self.tolerance_um)
 
-    @property
-    def homing_s(self) -> float:
-        """How long homing may take at the set speed: there and, for an index, back."""
+    def homing_s(self, axes_on_bus: int) -> float:
+        """How long homing may take at the set speed, all axes of the bus at once: there and, for
+        an index, back.
+        """
         step_um = min(self.step_um_forward, self.step_um_reverse)
         way_um = HOMING_OVERTRAVEL * (self.travel_max_um - self.travel_min_um)
         ways = 2.0 if self.home_to == "index" else 1.0
-        return ways * way_um / (step_um * self.speed_hz) + HOMING_EXTRA_S
+        runs_s = HOMING_RESERVE * ways * way_um / (step_um * self.speed_hz)
+        to_end = self.home_to == "end" and self.drive == "closed_loop" and not self.limit_switches
+        chunks = math.ceil(way_um / HOMING_CHUNK_UM) + 3 if to_end else 0
+        answers = axes_on_bus * (HOMING_ANSWERS + CHUNK_ANSWERS * chunks)
+        return runs_s + answers * ANSWER_S + HOMING_EXTRA_S
 
 
 @dataclass(frozen=True)
@@ -262,7 +273,7 @@ def bridge_config_from_table(
         status_file=folder / status_file if status_file else state_dir / "bridge_status.json",
         heartbeat_s=heartbeat_s,
         deadman_s=deadman_s,
-        motion_timeout_s=float(keys.number("motion_timeout_s", 0.5, 600.0, default=60.0)),
+        motion_timeout_s=float(keys.number("motion_timeout_s", 0.5, 600.0, default=120.0)),
         motion_poll_s=float(keys.number("motion_poll_s", 0.002, 0.1, default=0.02)),
         controller_baud=keys.integer("controller_baud", 9600, 4_000_000, default=115200),
         controller_timeout_s=float(keys.number("controller_timeout_s", 0.005, 2.0, default=0.1)),
@@ -282,12 +293,14 @@ def bridge_config_from_table(
 
 
 def _check_homing_fits(config: BridgeConfig, where: str) -> None:
+    on_bus = Counter(axis.controller for axis in config.axes)
     for axis in config.axes:
-        if axis.home_um is not None and axis.homing_s > config.motion_timeout_s:
+        needs_s = axis.homing_s(on_bus[axis.controller])
+        if axis.home_um is not None and needs_s > config.motion_timeout_s:
             raise ConfigError(
                 f"{where}: bridge.motion_timeout_s: homing of {axis.name!r} may take "
-                f"{axis.homing_s:.0f} s at {axis.speed_hz} Hz, motion_timeout_s is "
-                f"{config.motion_timeout_s:g}"
+                f"{needs_s:.0f} s at {axis.speed_hz} Hz with {on_bus[axis.controller]} axes on its "
+                f"port, motion_timeout_s is {config.motion_timeout_s:g}"
             )
 
 

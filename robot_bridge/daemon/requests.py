@@ -12,6 +12,7 @@ from robot_bridge.daemon import rules
 from robot_bridge.daemon.arming import Arming
 from robot_bridge.daemon.bridge_journal import BridgeJournal
 from robot_bridge.daemon.bridge_view import BridgeView
+from robot_bridge.daemon.declaring import Declaring
 from robot_bridge.daemon.journal import CommandRecord, JournalError
 from robot_bridge.daemon.motion import Ending
 from robot_bridge.daemon.motion_in_flight import MotionInFlight
@@ -46,9 +47,11 @@ class Requests:
     motion: MotionInFlight
     motors: MotorWatch
     journal: BridgeJournal
+    declaring: Declaring
     refused: Counter[str]
 
-    def answer(self, request: Message) -> Answer:
+    def answer(self, request: Message) -> Answer | None:
+        """None: not yet; `go_on_declaring` has the answer in the end."""
         if isinstance(request, Move | Home):
             return self._answer_command(request)
         if isinstance(request, Rearm):
@@ -57,8 +60,23 @@ class Requests:
         if broken is not None:
             self.journal.note("refused", request=type(request).__name__, code=broken[0].value)
             return self.refuse(*broken)
+        answer = self._carried_out(lambda: _DO[type(request)](self, request))
+        later = isinstance(request, DeclarePosition) and self.declaring.under_way
+        return None if later else answer
+
+    def go_on_declaring(self) -> Answer | None:
+        answer = self._carried_out(self.declaring.go_on)
+        return None if self.declaring.under_way else answer
+
+    def give_up_declaring(self) -> Answer:
+        axes = ", ".join(self.declaring.give_up())
+        return self.refuse(
+            Code.STOP_LATCHED, f"a stop came first: declare the position of {axes} again"
+        )
+
+    def _carried_out(self, do: Callable[[], object]) -> Answer:
         try:
-            _DO[type(request)](self, request)
+            do()
         except JournalError as error:
             return self.refuse(Code.JOURNAL, str(error))
         except MotorError as error:
@@ -97,8 +115,7 @@ class Requests:
         self.journal.lock(request.locked, request.by)
 
     def _declare(self, request: DeclarePosition) -> None:
-        self.motion.declare_position(request.positions_um, request.within_um)
-        self.journal.note("declare", positions_um=request.positions_um, by=request.by)
+        self.declaring.begin(request)
 
     def _set_drives(self, request: SetDrives) -> None:
         self.motion.set_drives(on=request.on)

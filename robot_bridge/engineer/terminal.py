@@ -4,6 +4,7 @@ import argparse
 import contextlib
 import json
 import sys
+from collections.abc import Mapping
 
 from robot_bridge.daemon.config import AxisConfig, BridgeConfig
 
@@ -21,7 +22,23 @@ def show(args: argparse.Namespace, fields: dict[str, object]) -> None:
         print(json.dumps(fields))
         return
     for name, value in fields.items():
-        print(f"{name:20} {value}")
+        lines = (
+            [_said(part) for part in value] if isinstance(value, list | tuple) else [_said(value)]
+        )
+        print(f"{name:20} " + ("\n" + " " * 21).join(lines or ["-"]))
+
+
+def _said(value: object) -> str:
+    """Of a field, for people: no brackets and quotes; programs ask for --json."""
+    if isinstance(value, Mapping):
+        parts = ((name, _said(part), isinstance(part, Mapping)) for name, part in value.items())
+        said = ", ".join(
+            f"{name} ({part})" if deep else f"{name} {part}" for name, part, deep in parts
+        )
+        return said or "-"
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    return "-" if value in (None, "") else str(value)
 
 
 def confirm(args: argparse.Namespace, what: str) -> None:

@@ -7,7 +7,7 @@ declared. What does not add up is a fault `cannot_home` that says why; the posit
 then.
 """
 
-from robot_bridge.daemon.config import HOMING_OVERTRAVEL
+from robot_bridge.daemon.config import HOMING_CHUNK_UM, HOMING_OVERTRAVEL
 from robot_bridge.pmd import protocol as pmd_protocol
 from robot_bridge.pmd import units as pmd_units
 from robot_bridge.pmd.axis import PmdAxis
@@ -18,7 +18,6 @@ from robot_bridge.pmd.protocol import Command
 from robot_bridge.pmd.setup import INDEX_POSITION, disarm_index, verify
 from robot_bridge.pmd.status import Inputs
 
-CHUNK_UM = 2000.0  # of a run towards a mechanical end, between two looks at the encoder
 BACK_OFF_UM, PULL_OFF_UM, BACK_OFF_S = 1000.0, 500.0, 1.0
 SWITCH_DELAY_S = 0.02  # a switch may tell so late, and the motor stop: on the faster of two trips
 
@@ -194,15 +193,15 @@ def _run_to_end(axis: PmdAxis, outwards: int, search_um: float) -> Steps[None]:
     while gone_um < search_um:
         yield from axis.read_position()
         from_um = axis.position_um
-        microsteps = pmd_units.microsteps_from_um(axis.config, outwards * CHUNK_UM)
+        microsteps = pmd_units.microsteps_from_um(axis.config, outwards * HOMING_CHUNK_UM)
         stands = yield from axis.run_while_followed(microsteps)
         yield from axis.read_position()
         moved_um = axis.position_um - from_um
-        if stands or abs(moved_um) < STANDS * CHUNK_UM:
+        if stands or abs(moved_um) < STANDS * HOMING_CHUNK_UM:
             return
-        if outwards * moved_um < 0 or abs(moved_um) > CHUNK_UM / FOLLOWS:
-            raise _cannot(axis, disagreement(moved_um, outwards * CHUNK_UM))
-        gone_um += CHUNK_UM
+        if outwards * moved_um < 0 or abs(moved_um) > HOMING_CHUNK_UM / FOLLOWS:
+            raise _cannot(axis, disagreement(moved_um, outwards * HOMING_CHUNK_UM))
+        gone_um += HOMING_CHUNK_UM
     raise _cannot(axis, f"no end stop found within {search_um / 1000:.1f} mm")
 
 

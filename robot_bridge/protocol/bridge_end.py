@@ -194,8 +194,16 @@ class BridgeEnd:
     def answer(self, sequence: int, answer: Answer) -> None:
         """Answer the request `sequence`, and keep the answer for its repetitions."""
         assert self.session is not None
-        self._last_answer = framing.encode(Frame(Answer.KIND, self.session, sequence, pack(answer)))
+        self.keep_answer(sequence, answer)
         self._send(self._last_answer)
+
+    def keep_answer(self, sequence: int, answer: Answer) -> None:
+        """Late: it goes out when the request is repeated, for we speak only when spoken to."""
+        assert self.session is not None
+        if sequence == self._last_sequence:
+            self._last_answer = framing.encode(
+                Frame(Answer.KIND, self.session, sequence, pack(answer))
+            )
 
     def send_status(self, sequence: int, status: Status) -> None:
         assert self.session is not None

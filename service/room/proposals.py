@@ -16,7 +16,12 @@ from pydantic import BaseModel, ConfigDict
 
 from case_record.record import CaseRecord
 from case_record.rows import Event
-from service.procedure.scan_frame import ScanFrame, calibration_good_since, other_place_since
+from service.procedure.scan_frame import (
+    STUDY_ACCEPTED,
+    ScanFrame,
+    calibration_good_since,
+    other_place_since,
+)
 
 PROPOSED, TAKEN, REFUSED = "plan_proposed", "proposal_taken", "proposal_refused"
 WITHDRAWN = "proposal_withdrawn"
@@ -89,7 +94,12 @@ def host_of(one: Plan | ProposalState) -> str:
     """The machine that it came from: who connects again has another port."""
     if one.via == OPENIGTLINK:
         return one.sender.rpartition(":")[0] or one.sender
-    return one.sender.rpartition(" ")[2]
+    return machine_of(one.sender)
+
+
+def machine_of(dicom_sender: str) -> str:
+    """Its address, which follows the AE title: who sends may call itself what it likes."""
+    return dicom_sender.rpartition(" ")[2]
 
 
 def why_too_many(plan: Plan, known: Sequence[ProposalState]) -> str:
@@ -164,9 +174,31 @@ def why_other_frame(plan_frame: str, room_frame: str) -> str:
     return "it is given in a different frame of reference from the slices"
 
 
+def why_frameless(
+    record: CaseRecord, plan: Plan | ProposalState, slice_ids: Sequence[int] = ()
+) -> str:
+    """Why a place on an image that names no frame of reference need not be one of now; empty where
+    nothing says so. slice_ids: the images, if the listener knows them.
+    """
+    if plan.frame_of_reference_uid or plan.via == OPENIGTLINK:
+        return ""
+    if frame_of_reference(record):
+        return "it lies on an image that names no frame of reference, while newer slices do"
+    for row in map(record.slice, slice_ids):
+        frame = ScanFrame.of_header(row.header)
+        if row.seq <= calibration_good_since(record) or other_place_since(record, row.seq, frame):
+            return "the table may have moved since its image was acquired; plan it on a newer one"
+    return ""
+
+
 def frame_of_reference(record: CaseRecord) -> str:
-    """Of the newest slice that was used; empty where there is none yet."""
+    """Of the newest slice that was used, or of the study that a person accepted since; empty where
+    that names none, or there is none yet.
+    """
     row = record.last_slice("assigned") or record.last_slice()
+    accepted = record.last_event(STUDY_ACCEPTED)
+    if accepted is not None and (row is None or row.seq < accepted.seq):
+        return str(accepted.body.get("frame_of_reference") or "")
     return "" if row is None else str(row.header.get("frame_of_reference_uid") or "")
 
 

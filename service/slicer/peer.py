@@ -14,10 +14,10 @@ from typing import Any, Protocol
 
 import structlog
 
+from service.room.commands.allowance import Allowances
 from service.room.proposals import OPENIGTLINK, Plan, Verdict
 from service.room.refusal import ConflictError
 from service.room.state import RoomState
-from service.slicer.allowance import Allowances
 from service.slicer.answers import (
     Answer,
     acknowledge,

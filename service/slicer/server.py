@@ -23,9 +23,9 @@ from case_record.record import CaseRecord
 from room_config.load import Config, ConfigError
 from room_config.networks import address_of
 from room_config.openigtlink import OpenIgtLinkConfig
+from service.room.commands.allowance import Allowances
 from service.room.control import STALE_S, ControlLoop
 from service.room.state import RoomState
-from service.slicer.allowance import Allowances
 from service.slicer.peer import Peer
 from service.slicer.pose import CURRENT_POSITION, Pose, pose_message, pose_of
 from service.slicer.scene import Images, Scene, scene_of, stale

@@ -220,7 +220,7 @@ def content(*items: Dataset) -> FileDataset:
 
 
 def coordinates(kind: str, data: list[float], *inner: Dataset, **more) -> Dataset:
-    value_type = "SCOORD" if len(data) == 2 else "SCOORD3D"
+    value_type = "SCOORD" if len(data) == 2 or kind == "CIRCLE" else "SCOORD3D"
     name = [item(CodeValue="1", CodingSchemeDesignator="99TEST", CodeMeaning="TARGET")]
     return item(
         RelationshipType="CONTAINS", ValueType=value_type, ConceptNameCodeSequence=name,
@@ -306,6 +306,83 @@ def text_away_from_the_point() -> FileDataset:
     return made
 
 
+def graphic(kind: str, data: list[float]) -> Dataset:
+    return item(
+        GraphicAnnotationUnits="PIXEL", GraphicDimensions=2, NumberOfGraphicPoints=len(data) // 2,
+        GraphicData=data, GraphicType=kind,
+    )  # fmt: skip
+
+
+def text(word: str, at: list[float] | None = None) -> Dataset:
+    if at is None:
+        return item(UnformattedTextValue=word)
+    return item(UnformattedTextValue=word, AnchorPoint=at, AnchorPointAnnotationUnits="PIXEL")
+
+
+def drawn(*inside: Dataset, layer: str = "DRAWN") -> FileDataset:
+    """Graphics and texts in one annotation."""
+    made = presentation_state()
+    texts = [one for one in inside if "UnformattedTextValue" in one]
+    graphics = [one for one in inside if "GraphicType" in one]
+    made.GraphicAnnotationSequence = [
+        item(GraphicLayer=layer, GraphicObjectSequence=graphics, TextObjectSequence=texts)
+    ]
+    return made
+
+
+CIRCLE = graphic("CIRCLE", [10.5, 20.5, 16.5, 20.5])  # around ON_SLICE, 6 pixels
+OTHER_CIRCLE = graphic("CIRCLE", [12.5, 4.5, 12.5, 1.5])
+ELSEWHERE = graphic("POINT", [30.5, 30.5])
+
+
+@pytest.mark.parametrize(
+    "made",
+    [
+        drawn(CIRCLE, text("TARGET")),
+        drawn(CIRCLE, text("TARGET", [16.5, 21.5])),
+        drawn(CIRCLE, layer="TARGET"),
+        drawn(CIRCLE, text("TARGET", [14.5, 24.5]), OTHER_CIRCLE, text("ENTRY", [12.5, 3.5])),
+        drawn(CIRCLE, graphic("POINT", [10.5, 20.5]), text("TARGET", [11.5, 20.5])),
+        drawn(graphic("POINT", [10.5, 20.5]), OTHER_CIRCLE, layer="TARGET"),
+        content(coordinates("CIRCLE", [10.5, 20.5, 16.5, 20.5], image_item())),
+        content(
+            coordinates("CIRCLE", [12.5, 4.5, 12.5, 1.5], image_item()),
+            coordinates("POINT", [10.5, 20.5], image_item()),
+        ),
+    ],
+    ids=[
+        "beside a word", "word at its rim", "in a layer", "two of them", "around a point",
+        "a point first", "in a report", "in a report a point first",
+    ],
+)  # fmt: skip
+def test_a_circle_means_its_centre_and_a_point_outranks_it(desk, made):
+    body = noted(desk, made)
+    assert body.get("target_mm") == pytest.approx(ON_SLICE), body
+
+
+@pytest.mark.parametrize(
+    ("made", "why"),
+    [
+        (drawn(CIRCLE, text("TARGET", [30.5, 30.5])), "text at one place and a CIRCLE at another"),
+        (drawn(CIRCLE, OTHER_CIRCLE, text("TARGET")), "2 points are labelled TARGET"),
+        (drawn(CIRCLE, text("TARGET"), text("ENTRY")), "TARGET is a text that points at nothing"),
+        (
+            drawn(ELSEWHERE, text("TARGET", [9.5, 9.5]), text("ENTRY", [30.5, 30.5])),
+            "its TARGET has",
+        ),
+        (
+            drawn(graphic("ELLIPSE", [8, 20, 12, 20, 10, 18, 10, 22]), text("TARGET", [8.5, 20.5])),
+            "text at one place and a ELLIPSE at another",
+        ),
+        (drawn(graphic("POLYLINE", [1, 1, 9, 9]), layer="TARGET"), "is a POLYLINE, not a POINT or"),
+    ],
+)
+def test_a_drawing_that_may_mean_this_or_that_is_refused(desk, made, why):
+    body = noted(desk, made)
+    assert why in body.get("why", ""), body
+    assert "target_mm" not in body
+
+
 def report_of_loops() -> FileDataset:
     """Every item below refers to the whole again."""
     inner = [by_reference(1) for _ in range(40)]
@@ -327,7 +404,7 @@ def report_of_loops() -> FileDataset:
         (content(coordinates("POINT", [1.0, 2.0])), "TARGET is drawn on no image"),
         (content(coordinates("POINT", [1.0, 2.0], by_reference(1, 7))), "drawn on no image"),
         (outside_of_the_image(), "TARGET lies outside its image"),
-        (text_away_from_the_point(), "TARGET has its text at one place and a point at another"),
+        (text_away_from_the_point(), "TARGET has its text at one place and a POINT at another"),
         (report_of_loops(), "it is damaged"),
     ],
 )
@@ -343,6 +420,15 @@ def test_a_point_on_a_slice_that_does_not_belong_to_the_case_is_refused(desk):
     (row,) = desk.receive(other)
     assert row.reason_code == "other_frame_of_reference"
     assert "does not belong to this case" in noted(desk, presentation_state("1.2.826.0.77"))["why"]
+
+
+def test_of_a_slice_without_a_frame_of_reference_it_is_said_which_one_it_was(desk):
+    unnamed = mr_data_set("1.2.826.0.79", began_s=time.time() - 1)
+    del unnamed.FrameOfReferenceUID
+    (row,) = desk.receive(unnamed)
+    assert row.state == "assigned"
+    body = noted(desk, presentation_state("1.2.826.0.79"))
+    assert (body["frame_of_reference_uid"], body["slice_ids"]) == ("", [row.slice_id])
 
 
 def test_a_point_on_an_image_of_several_frames_names_the_frame(desk):

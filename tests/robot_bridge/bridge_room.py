@@ -29,6 +29,7 @@ link = "{link}"
 state_dir = "{state_dir}"
 heartbeat_s = 0.1
 deadman_s = 1.0
+motion_timeout_s = 200
 {extra}
 """
 

@@ -5,6 +5,7 @@ Real processes for the emulator, real pseudo-terminals; no room, no link, no dae
 
 import contextlib
 import os
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -40,10 +41,16 @@ def test_the_first_day_of_a_bench(tmp_path: Path, drives: dict[str, str]):
             found = room.direct("find-encoder", "xt")
             assert found["encoder_direction"] == 0
             assert found["counts_per_mm_if_steps_are_right"] == pytest.approx(10_000, rel=0.02)
+            assert found["for_the_file"] == ["encoder_direction = 0"]
             measured = room.direct("calibrate-steps", "xt", "--runs", "2")
-            assert measured["step_um_forward"] == pytest.approx(4.5, rel=0.01)
+            lines = tomllib.loads("\n".join(measured["for_the_file"]))
+            both = ("step_um_forward", "step_um_reverse")
+            assert lines == pytest.approx(dict.fromkeys(both, 4.5), rel=0.01)
         room.tell("push 1 0.5")
-        assert room.direct("--at", "xt=0", "jog", "xt", "0.2")["state"] == "DONE"
+        jogged = room.direct("--at", "xt=0", "jog", "xt", "0.2")
+        assert jogged["state"] == "DONE"
+        assert isinstance(jogged["readback_um"].pop("xt"), int)
+        assert set(jogged["readback_um"].values()) <= {"unknown"}
         truth_mm = room.truth_mm()
         assert truth_mm["1"] == pytest.approx(0.7, abs=0.02)
         assert all(truth_mm[a] == 0 for a in truth_mm if a != "1")
@@ -66,6 +73,23 @@ def test_boards_get_their_addresses_one_by_one(tmp_path: Path):
         boards = room.robot("scan", room.port)[1]["boards"]
         assert [board["address"] for board in boards] == [1, 5]
         assert room.robot("set-address", room.port, "9", "3")[0] == 3
+
+
+def test_people_are_told_without_brackets_and_quotes(tmp_path: Path, capsys):
+    with bench(tmp_path, "0,5") as room:
+        assert main(["scan", room.port]) == 0
+        said = capsys.readouterr().out.splitlines()
+        assert said[0] == f"{'boards':20} address 0, identity PMD401 V13, serial_number 4010001"
+        assert said[1].strip() == "address 5, identity PMD401 V13, serial_number 4010002"
+        room.write_file({"xt": "open_loop"})
+        file = tmp_path / "bench.toml"
+        file.write_text(file.read_text().replace("address = 1", "address = 5"))
+        assert main(["--config", str(file), "--direct", "status"]) == 0
+        said = capsys.readouterr().out
+        assert "positions_um         xt unknown\n" in said
+        assert "xt (volts_48 47.2, board_celsius 41)\n" in said
+        assert "armed                no\n" in said
+        assert not set("[]{}'") & set(said)
 
 
 def test_a_port_where_nobody_answers_or_that_is_not_there(tmp_path: Path):
@@ -129,6 +153,12 @@ def test_another_board_is_refused_until_it_is_accepted(tmp_path: Path):
         said = room.refused("status")
         assert "board 7777" in said
         assert "4010001" in said
+        assert "accept-boards" in said
+        file = tmp_path / "bench.toml"
+        ours = file.read_text()
+        file.write_text(ours + "serial_number = 4010001\n")  # the file is believed, not the command
+        assert "change serial_number in the file" in room.refused("accept-boards")
+        file.write_text(ours)
         assert room.direct("accept-boards") == {"boards": {"xt": "7777"}}
         room.direct("status")
 

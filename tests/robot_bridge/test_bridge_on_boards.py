@@ -4,7 +4,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from pmd_bench import Bench
+from pmd_bench import NAMES, Bench
 from pmd_rig import StageWithEnds
 
 from robot_bridge.daemon.bridge import Bridge
@@ -13,7 +13,9 @@ from robot_bridge.daemon.journal import CommandRecord, Journal
 from robot_bridge.daemon.main import growth_of
 from robot_bridge.emulator.axis import Motor
 from robot_bridge.emulator.settings import INDEX_OFFSET
-from robot_bridge.protocol.messages import Code, CommandState
+from robot_bridge.protocol.framing import encode_stop
+from robot_bridge.protocol.messages import Answer, Code, CommandState, DeclarePosition
+from robot_bridge.protocol.service_end import Answered, ServiceEnd
 
 
 class Room:
@@ -36,6 +38,7 @@ class Room:
             wall_clock=lambda: self.line.now_s,
         )
         self.motion = self.bridge._motion
+        self.deaf_s = 0.0
 
     def run(self, seconds: float, until: Callable[[], bool] = lambda: False) -> None:
         end_s = self.line.now_s + seconds
@@ -47,6 +50,15 @@ class Room:
     def move(self, **setpoints_um: int) -> None:
         name = f"move {self.line.now_s}"
         self.motion.accept(CommandRecord(name, "move", setpoints_um, None, self.motion.last_motion))
+
+    def listen(self, data: bytes = b"") -> None:
+        """One turn of the daemon's loop; how long it was deaf is noted."""
+        began_s = self.line.now_s
+        self.bridge.receive(data)
+        self.bridge._fresh_s = self.line.now_s
+        self.bridge.tick()
+        self.deaf_s = max(self.deaf_s, self.line.now_s - began_s)
+        self.line.wait(0.005)
 
     def home(self) -> None:
         self.motion.accept(CommandRecord("home", "home", {}, None, self.motion.last_motion))
@@ -171,3 +183,60 @@ def test_the_count_at_the_index_is_believed_only_if_it_is_told_twice_alike(what)
     status = bench.finish()
     assert status.fault in ("cannot_home", "no_answer")
     assert "xt" not in status.certain_axes
+
+
+def declared_by_a_service(room: Room, turns_before_stop: int = 1000) -> Answer:
+    """Asked again until it is answered, as a client does."""
+    service, answers = ServiceEnd(), []
+
+    def turn(data: bytes) -> None:
+        room.listen(data)
+        events = service.receive(room.bridge.take_output(), room.line.now_s)
+        answers.extend(event.answer for event in events if isinstance(event, Answered))
+
+    service.say_hello(round(room.line.now_s * 1000), "test", room.line.now_s)
+    turn(service.take_output())
+    seen_ms = room.bridge.status().now_ms
+    positions_um = {axis: 1000 * number for number, axis in enumerate(room.bench.names, 1)}
+    service.send_request(DeclarePosition(positions_um, "test", seen_ms), room.line.now_s)
+    for number in range(300):
+        service.tick(room.line.now_s)
+        stop = encode_stop(7, False) if number == turns_before_stop else b""
+        turn(service.take_output() + stop)
+        if answers:
+            return answers[0]
+    raise AssertionError("no answer")
+
+
+@pytest.mark.parametrize("latency_s", [0.0, 0.016, 0.03])
+def test_a_declaration_of_four_axes_does_not_make_the_bridge_deaf(tmp_path, latency_s):
+    bench = Bench(latency_s=latency_s, declare=False)
+    room = Room(bench, tmp_path)
+    answer = declared_by_a_service(room)
+    assert (answer.code, room.motion.certain) == (Code.OK, True)
+    assert bench.motors.poll().readback_um == {"xt": 1000, "yt": 2000, "xb": 3000, "yb": 4000}
+    assert room.deaf_s < 0.3
+
+
+def test_a_stop_between_the_axes_of_a_declaration_ends_it(tmp_path):
+    room = Room(Bench(latency_s=0.03, declare=False), tmp_path)
+    answer = declared_by_a_service(room, turns_before_stop=1)
+    assert room.bridge.stopped
+    assert answer.code == Code.STOP_LATCHED
+    assert set(room.motion.certain_axes) < set(NAMES)
+    assert all(axis in answer.text for axis in set(NAMES) - room.motion.certain_axes)
+    room.run(1.0)
+    assert declared_by_a_service(room).code == Code.OK, "once more, while the stop is latched"
+    assert room.motion.certain
+
+
+def test_a_declaration_waits_for_a_board_that_is_set_up_again_and_listens_meanwhile(tmp_path):
+    bench = Bench(latency_s=0.03, declare=False)
+    room = Room(bench, tmp_path)
+    room.run(0.5)
+    bench.board.power_on(room.line.now_s, deaf_s=0.1)
+    room.run(2.0, until=lambda: room.bridge.motors.status.setting_up)
+    assert room.bridge.motors.status.setting_up
+    answer = declared_by_a_service(room)
+    assert (answer.code, room.motion.certain) == (Code.OK, True)
+    assert room.deaf_s < 0.3

@@ -86,6 +86,19 @@ def test_a_bad_table_is_refused_with_the_key_by_name(old: str, new: str, message
     assert "\n" not in str(caught.value)
 
 
+def test_homing_needs_more_time_the_more_axes_share_a_slow_bus():
+    first, second = GOOD.split("[[bridge.axis]]")[1:]
+    first = first.replace("travel_min_mm = -12.3456", "travel_min_mm = -40\nhome_mm = -40")
+    alone = f"{GOOD.split('[[bridge.axis]]')[0]}[[bridge.axis]]{first}"
+    config = load(alone)
+    asked_s = config.axes[0].homing_s(1)
+    timeout = f"motion_timeout_s = {asked_s + 0.1:.1f}\n"
+    load(alone.replace("[bridge]\n", f"[bridge]\n{timeout}"))
+    both = f"{alone}[[bridge.axis]]{second}".replace("[bridge]\n", f"[bridge]\n{timeout}")
+    with pytest.raises(ConfigError, match=r"homing of 'xt' may take .* with 2 axes on its port"):
+        load(both)
+
+
 @pytest.mark.parametrize("table", [[], 7, None, {"link": "a", "state_dir": "b", "axis": [7]}])
 def test_a_table_that_is_none_is_a_config_error(table):
     with pytest.raises(ConfigError, match=r"room\.toml"):

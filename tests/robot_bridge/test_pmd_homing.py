@@ -268,3 +268,20 @@ def test_a_motor_whose_encoder_is_dead_is_not_run_far(to: str):
     made.motors.home(["xt"])
     assert made.finish().fault == "cannot_home"
     assert abs(made.truth_um()) < 1500
+
+
+@pytest.mark.parametrize("home_to", ["end", "switch", "index"])
+def test_four_axes_on_one_slow_bus_home_within_the_time_that_is_asked_for_them(home_to: str):
+    """The longest way: from the other end, or for an index to the end and back again."""
+    motor = Motor(index_um=19_000.0) if home_to == "index" else SWITCHED
+    changes: dict[str, object] = {"home_to": "index"} if home_to == "index" else {}
+    if home_to == "switch":
+        changes = dict(WIRED)
+    made = Bench(latency_s=0.03, stage=StageWithEnds, motor=motor, home_um=-20_000, **changes)
+    for board in made.boards:
+        board.physics._position_um = 18_000.0 if home_to == "index" else 19_900.0
+    made.restart()
+    began_s = made.line.now_s
+    made.motors.home()
+    assert made.finish().certain
+    assert made.line.now_s - began_s < made.axes[0].homing_s(len(made.axes))

@@ -1,6 +1,9 @@
 """The line by other ways than a pseudo-terminal, and lines that are not there."""
 
+import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -96,3 +99,18 @@ def test_the_end_of_the_other_side_is_a_transport_error():
     with pytest.raises(TransportError, match="disconnected"):
         line.write(b"abc")
     line.close()
+
+
+def test_a_line_that_is_ended_takes_its_links_along_but_no_others(tmp_path: Path):
+    """A link that stays would lead to whatever gets that terminal next."""
+    ends = [tmp_path / "near", tmp_path / "far"]
+    words = ("-m", "simulator.serial_line", "--near", ends[0], "--far", ends[1])
+    with subprocess.Popen([sys.executable, *words], stdout=subprocess.PIPE) as line:
+        assert line.stdout is not None
+        line.stdout.readline()
+        assert all(end.is_symlink() for end in ends)
+        ends[1].unlink()
+        ends[1].symlink_to("/dev/null")
+        line.send_signal(signal.SIGTERM)
+        assert line.wait(5.0) == 0
+    assert [end.is_symlink() for end in ends] == [False, True]

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from robot_bridge.protocol.phases import WorkPhase
+from service.room.commands.allowance import Allowance, Allowances
 from service.room.proposals import Verdict
 from service.room.state import RobotState, RoomState
-from service.slicer.allowance import Allowance, Allowances
 from service.slicer.answers import (
     acknowledge,
     answer,

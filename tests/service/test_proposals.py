@@ -110,6 +110,84 @@ def test_a_frame_of_reference_that_no_slice_confirms_yet_is_not_accepted(tmp_pat
         assert room.later().target_patient_mm == place
 
 
+def test_workstations_that_flood_are_heeded_at_a_measured_pace_and_the_last_plan_counts(tmp_path):
+    """Two at once; half of what they send is refused."""
+    with running_line_room(tmp_path) as room:
+        room.calibrate()
+
+        def flood():
+            for n in range(400):
+                for host in ("10.0.0.5", "10.0.0.6"):
+                    body = {"sender": f"STATION {host}", "name": f"{n}", "via": "DICOM SR"}
+                    if n % 2:
+                        body |= {
+                            "target_mm": [*TARGET[:2], TARGET[2] + n / 1000],
+                            "frame_of_reference_uid": "1.2.9",
+                        }
+                    else:
+                        body |= {"why": "its TARGET is nowhere"}
+                    room.loop._record.append_event("plan_received", body, source="listener")
+
+        room.do(flood)
+        last = room.until(lambda s: [p.name for p in s.proposals].count("399") == 2)
+        with room.record() as record:
+            kinds = ("plan_proposed", "proposal_turned_away", "alarm")
+            proposed, refused, alarms = map(record.events_of_kind, kinds)
+        assert len(proposed) + len(refused) <= 2 * 15
+        assert all(one.state == "open" for one in last.proposals if one.name == "399")
+        floods = [a.body["text"] for a in alarms if a.body["alarm"] == "plans_too_many"]
+        assert sorted(text.split()[0] for text in floods) == ["10.0.0.5", "10.0.0.6"]
+
+
+FRAMELESS = {"target_mm": list(patient_mm(41.0, 58.0)), "frame_of_reference_uid": ""}
+
+
+def test_no_two_places_match_because_neither_says_its_frame_of_reference(tmp_path):
+    with running_line_room(tmp_path) as room:
+        room.header["frame_of_reference_uid"] = ""
+        room.calibrate()
+        bind(room, BOUND, "")
+        with room.record() as record:
+            before = record.last_slice("assigned").slice_id
+        by_dicom(room, slice_ids=[before], **FRAMELESS)
+        room.until(lambda s: s.proposals[-1:] and s.proposals[-1].state == "open")
+        bind(room, ACCEPTED, "", "1.2.1")
+        room.until(lambda s: s.proposals[-1].state == "withdrawn")
+        by_dicom(room, name="LATE", slice_ids=[before], **FRAMELESS)
+        state = room.until(lambda s: [a for a in s.alarms if "LATE" in a.text])
+        assert [p.name for p in state.proposals] == ["PLAN"]
+        assert "the table may have moved since its image was acquired" in state.alarms[0].text
+
+
+def test_a_plan_without_a_frame_of_reference_is_not_one_of_slices_that_have_one(tmp_path):
+    with running_line_room(tmp_path) as room:
+        room.header["frame_of_reference_uid"] = ""
+        room.calibrate()
+        with room.record() as record:
+            before = record.last_slice("assigned").slice_id
+        by_dicom(room, slice_ids=[before], **FRAMELESS)
+        number = room.until(lambda s: s.proposals).proposals[-1].number
+        room.header["frame_of_reference_uid"] = "1.2.9"
+        room.calibrate()
+        with pytest.raises(ConflictError, match="names no frame of reference"):
+            room.call("take_proposal", number=number, in_water=False)
+        by_dicom(room, name="LATE", slice_ids=[before], **FRAMELESS)
+        room.until(lambda s: [a for a in s.alarms if "LATE" in a.text])
+
+
+def test_a_plan_of_before_a_study_was_accepted_is_of_another_frame(tmp_path):
+    """Though no slice of the new one has come yet."""
+    with running_line_room(tmp_path) as room:
+        room.calibrate()
+        bind(room, BOUND, "1.2.9")
+        bind(room, ACCEPTED, "1.2.8", "1.2.4")
+        place = {"target_mm": list(TARGET), "frame_of_reference_uid": "1.2.9"}
+        by_dicom(room, **place)
+        state = room.until(lambda s: [a for a in s.alarms if a.code == "plan_refused"])
+        assert "a different frame of reference" in state.alarms[0].text
+        assert not state.proposals
+
+
 def sent_from(sender, **more):
     return Plan(**{"sender": sender, "name": "T", "via": OPENIGTLINK, "target_mm": None} | more)
 

@@ -13,6 +13,7 @@ import structlog
 from case_record.rows import Event
 from service.procedure.registry import latest_calibration
 from service.procedure.scan_frame import newest_frame
+from service.room.commands.allowance import Allowances, Said
 from service.room.commands.target import TargetCommands
 from service.room.context import RoomContext
 from service.room.proposals import (
@@ -27,6 +28,8 @@ from service.room.proposals import (
     ProposalState,
     Verdict,
     frame_of_reference,
+    machine_of,
+    why_frameless,
     why_no_direction,
     why_not_in_bore,
     why_other_frame,
@@ -51,6 +54,8 @@ class ProposalCommands:
         self._room = room
         self._target = target
         self._book = ProposalBook()
+        self._allowances, self._said = Allowances(), Said()
+        self._put_off: dict[str, Event] = {}  # by machine, the newest of those that came too fast
         self._seen_event_id = -1
         self._looked_at = (-1, -1)
 
@@ -60,23 +65,54 @@ class ProposalCommands:
         """
         record = self._room.record
         changes = record.change_count()
-        if changes == self._looked_at:
-            return
-        self._looked_at = changes
-        self._withdraw_void()
+        if changes != self._looked_at:
+            self._looked_at = changes
+            self._withdraw_void()
+            for event in self._received():
+                self._put_off_another(event)
+        for machine, event in list(self._put_off.items()):
+            if self._allowances.of(machine, PLAN_RECEIVED).take():
+                del self._put_off[machine]
+                self._heed(event)
+
+    def _received(self) -> list[Event]:
+        """What the listener noted since the last look."""
+        record = self._room.record
         newest = record.last_event_id()
         if newest == self._seen_event_id:
-            return
+            return []
         if self._seen_event_id < 0:
             done = [*record.events_of_kind(PROPOSED), *record.events_of_kind(TURNED_AWAY)]
             self._seen_event_id = max((e.body.get("received", 0) for e in done), default=0)
         events = record.events_of_kind(PLAN_RECEIVED, after_id=self._seen_event_id)
         self._seen_event_id = newest
-        for event in events:
-            try:
-                self._propose_received(event)
-            except (KeyError, TypeError, ValueError):  # whatever stands in it must not end the loop
-                log.exception("plan not proposed", event_id=event.event_id)
+        return events
+
+    def _put_off_another(self, event: Event) -> None:
+        """Every plan that comes waits for its machine's allowance; who waits too long is outdated
+        by the next.
+        """
+        machine = machine_of(str(event.body.get("sender")))
+        before = self._put_off.pop(machine, None)
+        if before is not None and self._allowances.of(machine, PLAN_RECEIVED).take():
+            self._heed(before)
+        elif before is not None:
+            self._alarm(
+                "plans_too_many",
+                f"{machine} sends plans faster than one per second: some were not looked at; the "
+                "last one counts",
+            )
+        self._put_off[machine] = event
+
+    def _alarm(self, code: str, text: str) -> None:
+        if self._said.is_news(text):
+            self._room.note("alarm", "", {"alarm": code, "text": text})
+
+    def _heed(self, event: Event) -> None:
+        try:
+            self._propose_received(event)
+        except (KeyError, TypeError, ValueError):  # whatever stands in it must not end the loop
+            log.exception("plan not proposed", event_id=event.event_id)
 
     def _withdraw_void(self) -> None:
         for one in self._book.update(self._room.record):
@@ -98,8 +134,9 @@ class ProposalCommands:
             entry_mm=_place(body.get("entry_mm")),
             frame_of_reference_uid=body.get("frame_of_reference_uid", ""),
         )
-        if "why" in body:
-            self._turn_away(plan, plan.sender, body["why"], event.event_id)
+        why = body.get("why") or why_frameless(self._room.record, plan, body.get("slice_ids", ()))
+        if why:
+            self._turn_away(plan, plan.sender, why, event.event_id)
         else:
             self.propose(plan, plan.sender, received=event.event_id)
 
@@ -111,7 +148,7 @@ class ProposalCommands:
             room.note(TURNED_AWAY, by, {**told, "received": received})
             if received:
                 text = f"plan {plan.name} ({plan.via}) from {plan.sender} was refused: {why}"
-                room.note("alarm", "", {"alarm": "plan_refused", "text": text})
+                self._alarm("plan_refused", text)
 
     def propose(self, plan: Plan, by: str, received: int = 0) -> Verdict:
         """Record a plan for the operator to see, unless it cannot be one.
@@ -168,10 +205,15 @@ class ProposalCommands:
         room = self._room
         plan = Plan(one.sender, one.name, one.via, one.target_mm, one.entry_mm, one.direction)
         here = frame_of_reference(room.record)
-        why = why_other_frame(one.frame_of_reference_uid, here) or self._why_void(number)
+        why = (
+            why_other_frame(one.frame_of_reference_uid, here)
+            or why_frameless(room.record, one)
+            or self._why_void(number)
+        )
         if one.frame_of_reference_uid and not here:
             why = (
-                "whether the table has moved since it was planned is not known yet: acquire a slice"
+                "no slice names its frame of reference yet: whether the table has moved since it "
+                "was planned is not known; acquire a slice"
             )
         if why:
             raise ConflictError("other_frame", f"Not accepted: {why}.")

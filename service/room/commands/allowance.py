@@ -9,6 +9,7 @@ import time
 from collections.abc import Callable
 
 _AT_ONCE, _PER_S = 10.0, 1.0
+_AGAIN_S = 60.0
 
 
 class Allowance:
@@ -47,3 +48,19 @@ class Allowances:
         for key in [key for key, one in self._known.items() if one.is_whole]:
             del self._known[key]
         return self._known.setdefault((host, kind), Allowance())
+
+
+class Said:
+    """What was said within the last minute is not said again."""
+
+    def __init__(self, now_s: Callable[[], float] = time.monotonic) -> None:
+        self._now_s = now_s
+        self._at_s: dict[str, float] = {}
+
+    def is_news(self, text: str) -> bool:
+        now_s = self._now_s()
+        self._at_s = {one: at_s for one, at_s in self._at_s.items() if now_s - at_s < _AGAIN_S}
+        if text in self._at_s:
+            return False
+        self._at_s[text] = now_s
+        return True
