@@ -250,11 +250,13 @@ class BridgeClient:
 
     # --- STOP ---------------------------------------------------------------------------------
 
-    def request_stop(self, *, emergency: bool = False) -> None:
+    def request_stop(self, *, emergency: bool = False, nonce: int | None = None) -> None:
         """From any thread, with or without a session: send STOP now and repeat it until the bridge
         acknowledged it. EMERGENCY also parks the drives. Returns at once.
+
+        nonce: of a STOP that was sent already by another way.
         """
-        self._stopper.request(emergency)
+        self._stopper.request(emergency, nonce)
 
     @property
     def stop_acknowledged(self) -> bool:

@@ -40,11 +40,13 @@ class Stopper:
     def pending(self) -> bool:
         return self._pending is not None
 
-    def request(self, emergency: bool) -> None:
+    def request(self, emergency: bool, nonce: int | None = None) -> None:
+        """nonce: of a STOP that was sent already by another way, and is to be seen through."""
         with self._changed:
             if self._pending is not None:
                 emergency = emergency or self._pending[1]
-            self._pending = (self._random_bits(32), emergency)
+            nonce = self._random_bits(32) if nonce is None else nonce
+            self._pending = (nonce, emergency)
             self._sent_s = -1e9
             if self._thread is None and self._threaded:
                 self._thread = threading.Thread(target=self._watch, name="stop", daemon=True)

@@ -68,7 +68,7 @@ class Bridge:
             boot_id=boot_id, timeout_s=settings.motion_timeout_s,
             whereabouts=self._whereabouts(settings, journal), stop_for=self.stop_for,
         )  # fmt: skip
-        self._declaring = Declaring(self._motion, self._journal, clock)
+        self._declaring = Declaring(self._motion, self.motors, self._journal, clock)
         self._declared_for = 0  # the request's sequence number
         self._view = BridgeView(
             settings, boot_id, self._permission, self._motion, self.motors, self._journal,

@@ -8,22 +8,30 @@ from collections.abc import Callable
 
 from robot_bridge.daemon.bridge_journal import BridgeJournal
 from robot_bridge.daemon.motion_in_flight import MotionInFlight
+from robot_bridge.daemon.motor_watch import MotorWatch
 from robot_bridge.protocol.messages import DeclarePosition
 
 TURN_S = 0.05  # after that long no other axis is begun before the line was looked at
+SETTING_UP_S = 1.5  # so long the polls may go on with setting up a board
 
 
 class Declaring:
     """`under_way`: some of the named axes are still to be declared. `just_begun`: in this turn."""
 
     def __init__(
-        self, motion: MotionInFlight, journal: BridgeJournal, clock: Callable[[], float]
+        self,
+        motion: MotionInFlight,
+        motors: MotorWatch,
+        journal: BridgeJournal,
+        clock: Callable[[], float],
     ) -> None:
         self._motion = motion
+        self._motors = motors
         self._journal = journal
         self._clock = clock
         self._request: DeclarePosition | None = None
         self._left: list[str] = []
+        self._begun_s = 0.0
         self.just_begun = False
 
     @property
@@ -33,6 +41,7 @@ class Declaring:
     def begin(self, request: DeclarePosition) -> None:
         """Raises MotorError, JournalError; then it has ended."""
         self._request, self._left = request, list(request.positions_um)
+        self._begun_s = self._clock()
         self.go_on()
         self.just_begun = True
 
@@ -40,6 +49,8 @@ class Declaring:
         """One turn. Raises like `begin`."""
         request, left = self._request, self._left
         assert request is not None
+        if self._motors.status.setting_up and self._clock() < self._begun_s + SETTING_UP_S:
+            return
         self._left = []  # what fails ends it
         until_s = self._clock() + TURN_S
         while left:

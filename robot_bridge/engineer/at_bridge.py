@@ -131,7 +131,9 @@ def jog(args: argparse.Namespace, config: BridgeConfig) -> None:
     with connected(args, config) as client:
         setpoints_um = dict(client.status.positions_um)
         setpoints_um[args.axis] += round(args.mm * 1000)
-        confirm(args, f"move {args.axis} by {args.mm:+g} mm to {setpoints_um[args.axis]} um")
+        known = args.axis in client.status.certain_axes
+        to = f" to {setpoints_um[args.axis]} um" if known else ""
+        confirm(args, f"move {args.axis} by {args.mm:+g} mm{to}")
         outcome = _while_armed(
             args, client, lambda: client.move(_command_id("jog"), setpoints_um, None)
         )
@@ -142,7 +144,8 @@ def home(args: argparse.Namespace, config: BridgeConfig) -> None:
     with connected(args, config) as client:
         for name in args.axes:
             axis_named(config, name)
-        confirm(args, f"drive {', '.join(args.axes) or 'every axis'} to the end of its travel")
+        axes = ", ".join(args.axes) or "every axis"
+        confirm(args, f"drive {axes} to its reference, up to the end of the travel")
         outcome = _while_armed(
             args, client, lambda: client.home(_command_id("home"), args.by, args.axes)
         )
@@ -191,9 +194,10 @@ def stop(args: argparse.Namespace, config: BridgeConfig) -> None:
         show(args, stop_motors(args, config))
         return
     client = _client_on_the_line(args, config)
-    _shout_stop(args.link or str(config.service_link), config.link_baud, args.emergency)
+    nonce = secrets.randbits(32)
+    _shout_stop(args.link or str(config.service_link), config.link_baud, args.emergency, nonce)
     try:
-        client.request_stop(emergency=args.emergency)
+        client.request_stop(emergency=args.emergency, nonce=nonce)
         client.open(args.timeout)
         _await_acknowledgement(client)
         show(args, _status_fields(client.status))
@@ -205,11 +209,11 @@ def stop(args: argparse.Namespace, config: BridgeConfig) -> None:
         client.close()
 
 
-def _shout_stop(url: str, baud: int, emergency: bool) -> None:
+def _shout_stop(url: str, baud: int, emergency: bool, nonce: int) -> None:
     """Before anything else, session or not, and even if another program has the line."""
     line = SerialTransport(url, baud, exclusive=False)
     try:
-        frame = encode_stop(secrets.randbits(32), emergency)
+        frame = encode_stop(nonce, emergency)
         for _ in range(SHOUTS):
             line.write(frame)
             time.sleep(0.01)

@@ -77,6 +77,7 @@ def find_encoder(args: argparse.Namespace, config: BridgeConfig) -> None:
                 found.counts_per_step * 1000 / axis.counts_per_mm, 3
             ),
             "counts_per_mm_if_steps_are_right": round(found.counts_per_step * 1000 / step_um, 1),
+            "for_the_file": [f"encoder_direction = {found.direction}"],
         },
     )
 

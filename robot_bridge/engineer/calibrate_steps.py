@@ -53,12 +53,16 @@ class StepCalibration:
         return 2 * (forward_um - reverse_um) / (forward_um + reverse_um)
 
     def as_fields(self) -> dict[str, object]:
-        """The two step lengths under their names in the axis's table of the room's file."""
+        """`for_the_file`: the two step lengths as lines of the axis's table in the room's file."""
+        lengths = {
+            "step_um_forward": round(self.forward.step_um, 4),
+            "step_um_reverse": round(self.reverse.step_um, 4),
+        }
         return {
             "axis": self.axis,
-            "step_um_forward": round(self.forward.step_um, 4),
+            **lengths,
+            "for_the_file": [f"{name} = {um}" for name, um in lengths.items()],
             "step_um_forward_sigma": round(self.forward.sigma_um, 4),
-            "step_um_reverse": round(self.reverse.step_um, 4),
             "step_um_reverse_sigma": round(self.reverse.sigma_um, 4),
             "scatter_forward": round(self.forward.scatter, 5),
             "scatter_reverse": round(self.reverse.scatter, 5),

@@ -1,6 +1,8 @@
 """The serial ports of a robot's controllers: opening, capturing, stopping, closing."""
 
 import contextlib
+import errno
+import os
 import select
 import termios
 import time
@@ -59,6 +61,12 @@ class SerialPort:
         self._port.close()
 
 
+def _why(error: Exception) -> str:
+    """pyserial says the port's name twice over."""
+    number = getattr(error, "errno", None)
+    return os.strerror(number) if number in (errno.ENOENT, errno.EACCES) else str(error)
+
+
 class PmdPorts:
     """The lines by port URL, each with the addresses of the controllers on it."""
 
@@ -89,7 +97,7 @@ class PmdPorts:
                 # Whatever half line the controllers hold is cancelled.
                 port.write(b"\x1b;")
             except (OSError, ValueError) as error:
-                raise MotorError("no_port", f"controller port {url}: {error}") from error
+                raise MotorError("no_port", f"controller port {url}: {_why(error)}") from error
             self.lines[url] = PmdLine(port, self._timeout_s, self._clock)
 
     def _captured(self, port: Port, url: str) -> Port:

@@ -110,10 +110,12 @@ def _check_board(c: PmdController, board: str) -> None:
     wanted = c.config.serial_number
     known = str(wanted) if wanted else c.board
     if known and board != known:
+        accept = "change serial_number in the file" if wanted else "use accept-boards"
         raise c.error(
             "wrong_board",
             f"board {board or 'without a serial number'} answers on {c.config.controller} where "
-            f"board {known} belongs: two boards were swapped, or one was replaced",
+            f"board {known} belongs: two boards were swapped, or one was replaced (if on purpose, "
+            f"{accept})",
         )
 
 

@@ -6,7 +6,7 @@ from robot_bridge.pmd.axis import PmdAxis
 from robot_bridge.pmd.line import PmdLine, Procedure
 from robot_bridge.pmd.protocol import PmdError
 
-STOP_DEADLINE_S = 0.25
+STOP_DEADLINE_S = 0.28
 STOP_ANSWER_TIMEOUT_S = 0.06
 
 

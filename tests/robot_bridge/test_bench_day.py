@@ -5,6 +5,7 @@ Real processes for the emulator, real pseudo-terminals; no room, no link, no dae
 
 import contextlib
 import os
+import tomllib
 from pathlib import Path
 
 import pytest
@@ -40,8 +41,11 @@ def test_the_first_day_of_a_bench(tmp_path: Path, drives: dict[str, str]):
             found = room.direct("find-encoder", "xt")
             assert found["encoder_direction"] == 0
             assert found["counts_per_mm_if_steps_are_right"] == pytest.approx(10_000, rel=0.02)
+            assert found["for_the_file"] == ["encoder_direction = 0"]
             measured = room.direct("calibrate-steps", "xt", "--runs", "2")
-            assert measured["step_um_forward"] == pytest.approx(4.5, rel=0.01)
+            lines = tomllib.loads("\n".join(measured["for_the_file"]))
+            both = ("step_um_forward", "step_um_reverse")
+            assert lines == pytest.approx(dict.fromkeys(both, 4.5), rel=0.01)
         room.tell("push 1 0.5")
         jogged = room.direct("--at", "xt=0", "jog", "xt", "0.2")
         assert jogged["state"] == "DONE"
@@ -149,6 +153,12 @@ def test_another_board_is_refused_until_it_is_accepted(tmp_path: Path):
         said = room.refused("status")
         assert "board 7777" in said
         assert "4010001" in said
+        assert "accept-boards" in said
+        file = tmp_path / "bench.toml"
+        ours = file.read_text()
+        file.write_text(ours + "serial_number = 4010001\n")  # the file is believed, not the command
+        assert "change serial_number in the file" in room.refused("accept-boards")
+        file.write_text(ours)
         assert room.direct("accept-boards") == {"boards": {"xt": "7777"}}
         room.direct("status")
 

@@ -228,3 +228,15 @@ def test_a_stop_between_the_axes_of_a_declaration_ends_it(tmp_path):
     room.run(1.0)
     assert declared_by_a_service(room).code == Code.OK, "once more, while the stop is latched"
     assert room.motion.certain
+
+
+def test_a_declaration_waits_for_a_board_that_is_set_up_again_and_listens_meanwhile(tmp_path):
+    bench = Bench(latency_s=0.03, declare=False)
+    room = Room(bench, tmp_path)
+    room.run(0.5)
+    bench.board.power_on(room.line.now_s, deaf_s=0.1)
+    room.run(2.0, until=lambda: room.bridge.motors.status.setting_up)
+    assert room.bridge.motors.status.setting_up
+    answer = declared_by_a_service(room)
+    assert (answer.code, room.motion.certain) == (Code.OK, True)
+    assert room.deaf_s < 0.3

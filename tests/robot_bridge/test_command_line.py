@@ -89,7 +89,10 @@ def test_a_jog_from_an_uncertain_position_is_refused(tmp_path: Path):
 
 def test_stop_latches_and_rearm_clears_it(shared_room: BridgeRoom):
     room = shared_room
-    assert fields(robot(room, "stop"))["stopped"] is True
+    stopped = fields(robot(room, "stop"))
+    assert stopped["stopped"] is True
+    once_more = fields(robot(room, "stop"))
+    assert once_more["stop_count"] == stopped["stop_count"] + 1, "one command, one stop"
     refused = robot(room, "--yes", "jog", "xt", "1")
     assert refused.returncode == 3
     assert "stop_latched" in refused.stderr

@@ -3,6 +3,7 @@
 import itertools
 
 import pytest
+from pmd_bench import NAMES, Bench
 from pmd_rig import finish, opened, rig, wait_until
 from virtual_line import VirtualLine
 
@@ -127,3 +128,18 @@ def test_four_axes_on_one_bus_behind_a_slow_adapter(latency_s: float):
     line.motors.stop()
     assert line.now_s - begun_s < STOP_BOUND_S
     assert not line.moving()
+
+
+def test_stops_of_four_axes_behind_the_slowest_adapter_are_confirmed():
+    bench = Bench(latency_s=0.03)
+    bench.motors.move_to(dict.fromkeys(NAMES, 500))
+    assert bench.finish().reached
+    for number in range(12):
+        way_um = 8000 if number % 2 else -8000
+        bench.motors.move_to(dict.fromkeys(NAMES, way_um))
+        bench.poll_for(0.9 + 0.03 * number)
+        begun_s = bench.line.now_s
+        bench.motors.stop()  # raises if one does not confirm
+        assert bench.line.now_s - begun_s < STOP_BOUND_S
+        bench.rest(1.0)
+        bench.motors.declare_position({name: round(bench.truth_um(name)) for name in NAMES})
