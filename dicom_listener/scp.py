@@ -19,7 +19,7 @@ import structlog
 from pydicom.dataset import Dataset
 from pynetdicom import AE, _config, evt
 from pynetdicom.association import Association
-from pynetdicom.dimse_primitives import C_CANCEL
+from pynetdicom.dimse_primitives import C_CANCEL, C_STORE
 from pynetdicom.events import Event
 from pynetdicom.sop_class import StorageCommitmentPushModel
 
@@ -34,14 +34,16 @@ from dicom_listener.negotiation import (
     rejection_text,
     report_of,
 )
+from dicom_listener.network.bounded_socket import BoundedSocket
 from dicom_listener.network.commitment import Commitment
 from dicom_listener.network.endings import Ending, ending_of, who_of
+from dicom_listener.network.services import Refusal, refused_request
 from dicom_listener.network.store_request import (
     UnanswerableError,
     mend_store_request,
     uid_sent_under,
 )
-from dicom_listener.transport import BoundedSocket, PromptServer
+from dicom_listener.transport import PromptServer, keep_tracebacks
 from dicom_slice.preflight import NoDataSetError, peek
 from room_config.networks import address_of
 
@@ -55,6 +57,7 @@ _SAID_AGAIN_AFTER_S = 60.0
 
 log = structlog.get_logger("listener")
 
+keep_tracebacks()
 # pynetdicom's own accounts of messages fail on what is odd, and keep our handlers from it
 _config.LOG_HANDLER_LEVEL = "none"
 
@@ -170,6 +173,7 @@ class Scp:
             "max_message_bytes": 2 * rules.max_object_bytes,
             "pdu_deadline_s": rules.dimse_timeout_s,
             "on_refused": staticmethod(lambda why: self._alarm("oversize", why)),
+            "on_sends_ahead": staticmethod(self._on_sends_ahead),
         }
         settings = {
             "socket_class": type("RoomSocket", (BoundedSocket,), bounds),
@@ -182,6 +186,7 @@ class Scp:
             "on_dropped": staticmethod(self._on_dropped),
             "on_no_request": staticmethod(self._on_no_request),
             "on_ended": staticmethod(self._on_ended),
+            "on_not_offered": staticmethod(self._on_not_offered),
         }
         return type("RoomServer", (PromptServer,), settings)
 
@@ -283,7 +288,8 @@ class Scp:
         association, message = event.assoc, event.message
         sock = association.dul.socket
         try:
-            context = association._accepted_cx.get(message.context_id)
+            number = message.context_id
+            context = association._accepted_cx.get(number)
             syntax = str(context.transfer_syntax[0]) if context else ""
             mend_store_request(message, syntax)
             primitive = message.message_to_primitive()
@@ -292,8 +298,11 @@ class Scp:
                 text = f"{who_of(association)}: a C-CANCEL; there is nothing to cancel"
                 self._alarm("message_ignored", text)
             elif primitive.is_valid_response:
-                sock.message_done()  # somebody waits for it
-            elif not primitive.is_valid_request:
+                sock.message_done()
+                sock.speaking.heard(primitive)
+            elif not (
+                primitive.is_valid_request or refused_request(association, primitive, number)
+            ):
                 raise UnanswerableError("its message ID, SOP class or status is missing")
         except Exception as error:
             sock.message_done()
@@ -309,10 +318,28 @@ class Scp:
         event.assoc.dul.socket.message_done()
         if self._commitment is None:
             return CANNOT_UNDERSTAND, None
+        who = str(event.assoc.requestor.ae_title).strip()
+        speaking, context = event.assoc.dul.socket.speaking, event.context
+
+        def tell(kind: int, report: Dataset) -> str:
+            return str(speaking.report(kind, report, context))
+
         asked = event.action_information
-        status = self._commitment.answer(event.assoc, event.action_type, asked)
+        status = self._commitment.answer(who, event.action_type, asked, tell)
         self._metrics.commitments.labels(f"{status:04X}").inc()
         return status, None
+
+    def _on_not_offered(self, association: Association, message: Any, refusal: Refusal) -> None:
+        text = f"{who_of(association)}: {refusal.why}; answered 0x{refusal.status:04X}"
+        if isinstance(message, C_STORE):
+            self._metrics.refused.labels(f"{refusal.status:04X}").inc()
+            self._alarm("slice_refused", text)
+        else:
+            self._alarm("not_offered", text)
+
+    def _on_sends_ahead(self, association: Association) -> None:
+        text = f"{who_of(association)}: it sends on without waiting for answers, and is slowed down"
+        self._alarm("sends_ahead", text)
 
     def _on_store(self, event: Event) -> Dataset | int:
         began_s = event.assoc.dul.socket.message_done()

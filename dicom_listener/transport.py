@@ -1,19 +1,16 @@
 """TCP under the association: answers at once, waits for nobody for ever.
 
-Senders write the head and the body of a message as two segments; with Nagle's algorithm on their
-side and delayed acknowledgement on ours, every message would stall for 40 ms. So what arrives is
-acknowledged at once (TCP_QUICKACK, which the kernel forgets after every receive).
-
 A health check that connects and goes, a peer that says nothing, half a PDU, a TLS handshake that
 never ends: each holds one thread for a bounded time, and their number is bounded too.
 """
 
 import contextlib
+import logging
 import selectors
 import socket
 import ssl
+import sys
 import time
-from collections import deque
 from collections.abc import Callable
 from socketserver import TCPServer
 from typing import Any
@@ -22,133 +19,20 @@ import structlog
 from pynetdicom import evt
 from pynetdicom.association import Association
 from pynetdicom.events import Event
+from pynetdicom.fsm import InvalidEventError
 from pynetdicom.pdu import A_ABORT_RQ, A_ASSOCIATE_RJ
 from pynetdicom.timer import Timer
-from pynetdicom.transport import AssociationSocket, RequestHandler, ThreadedAssociationServer
+from pynetdicom.transport import RequestHandler, ThreadedAssociationServer
 
 from dicom_listener.lobby import Lobby, NoRequestError, await_request
+from dicom_listener.network.bounded_socket import BoundedSocket, acknowledge_at_once
 from dicom_listener.network.hearing import Hearing
+from dicom_listener.network.services import Refusal
+from dicom_listener.network.speaking import Speaking
 
 log = structlog.get_logger("listener")
 
-_QUICKACK = getattr(socket, "TCP_QUICKACK", None)
-_CHUNK_BYTES = 256 * 1024
 _MAY_BE_SILENT_S = 2.0
-
-
-def acknowledge_at_once(sock: socket.socket) -> None:
-    """Where the option does not exist (not Linux) it is simply not set."""
-    if _QUICKACK is not None:
-        sock.setsockopt(socket.IPPROTO_TCP, _QUICKACK, 1)
-
-
-class BoundedSocket(AssociationSocket):
-    """pynetdicom's socket with large reads, prompt acknowledgement, and limits.
-
-    A PDU or a message over its limit, or a PDU that takes too long, ends the connection.
-    """
-
-    max_pdu_bytes = 2**20
-    max_message_bytes = 2**30
-    pdu_deadline_s = 60.0
-    remarks: tuple[str, ...] = ()  # what was put right in the association request
-    on_refused: Callable[[str], None] = staticmethod(lambda why: None)
-
-    def __init__(self, assoc: Association, client_socket: socket.socket) -> None:
-        super().__init__(assoc, client_socket=client_socket)
-        self.message_bytes = 0
-        self.unfinished_bytes = 0
-        self.message_began_s: float | None = None
-        self._before_pdu: tuple[int, float | None] = (0, None)
-        self._began_whole_s: deque[float | None] = deque()  # of messages not answered yet
-        self.heard_s = time.monotonic()
-        self.why_ended: tuple[str, str] | None = None  # (kind, in words)
-        self.is_accounted_for = False
-
-    def note_ending(self, kind: str, why: str) -> None:
-        """Say why the association is about to end; what was seen first is the cause."""
-        if self.why_ended is None:
-            self.why_ended = kind, why
-
-    @property
-    def unanswered(self) -> int:
-        """How many messages were received whole and are not dealt with yet."""
-        return len(self._began_whole_s)
-
-    def pdu_begins(self) -> None:
-        self._before_pdu = self.unfinished_bytes, self.message_began_s
-
-    def pdu_is_no_message(self) -> None:
-        """What has just been read is no part of a message, but beside or between messages."""
-        self.unfinished_bytes, self.message_began_s = self._before_pdu
-        if self.message_began_s is None:
-            self.message_bytes = 0
-
-    def message_whole(self) -> None:
-        """With what has just been read a message is whole; start counting again."""
-        self._began_whole_s.append(self.message_began_s)
-        self.message_bytes = self.unfinished_bytes = 0
-        self.message_began_s = None
-
-    def message_done(self) -> float | None:
-        """One is dealt with; return the monotonic instant of its first byte."""
-        return self._began_whole_s.popleft() if self._began_whole_s else None
-
-    def recv(self, nr_bytes: int) -> bytearray:
-        sock = self.socket
-        if sock is None:
-            raise OSError("the connection is closed")
-        if self.message_began_s is None:
-            self.message_began_s = time.monotonic()
-        self._check_size(nr_bytes)
-        received = bytearray()
-        deadline_s = time.monotonic() + self.pdu_deadline_s
-        while len(received) < nr_bytes:
-            piece = self._next_piece(sock, nr_bytes - len(received))
-            if not piece:
-                self.note_ending("closed", "the sender closed the connection without a release")
-                break
-            acknowledge_at_once(sock)
-            self.unfinished_bytes += len(piece)
-            self.heard_s = time.monotonic()
-            received += piece
-            if len(received) < nr_bytes and time.monotonic() > deadline_s:
-                self._refuse(f"a PDU took longer than {self.pdu_deadline_s:g} s")
-        return received
-
-    def discard(self) -> None:
-        """Read what is there, and drop it. Raises OSError where the peer is gone."""
-        if self.socket is None or not self.socket.recv(_CHUNK_BYTES):
-            raise ConnectionError("the connection is closed")
-
-    def _next_piece(self, sock: socket.socket, nr_bytes: int) -> bytes:
-        try:
-            return sock.recv(min(_CHUNK_BYTES, nr_bytes))
-        except TimeoutError:
-            self.note_ending("stalled", f"no more of a PDU arrived for {sock.gettimeout():g} s")
-            raise
-        except OSError as error:
-            self.note_ending("broken", f"the connection was broken ({error.strerror or error})")
-            raise
-
-    def _shutdown_socket(self) -> None:
-        """Close in any case. (pynetdicom's own leaves it open where the peer is gone already.)"""
-        if self.socket is not None:
-            with contextlib.suppress(OSError):
-                self.socket.shutdown(socket.SHUT_RDWR)
-            self.socket.close()
-
-    def _check_size(self, nr_bytes: int) -> None:
-        self.message_bytes += nr_bytes
-        if nr_bytes > self.max_pdu_bytes:
-            self._refuse(f"a PDU of {nr_bytes} bytes ({self.max_pdu_bytes} allowed)")
-        if self.message_bytes > self.max_message_bytes:
-            self._refuse(f"a message of more than {self.max_message_bytes} bytes")
-
-    def _refuse(self, why: str) -> None:
-        self.note_ending("over_limit", why)
-        self.on_refused(why)
-        raise OSError(why)
 
 
 class SteadyTimer(Timer):
@@ -203,6 +87,8 @@ class PatienceTimer(SteadyTimer):
 
     @property
     def expired(self) -> bool:
+        if self._sock.unanswered:  # it waits for us, and may not even be read
+            self.restart()
         is_over = super().expired
         if is_over:
             self._sock.note_ending("idle", f"nothing arrived for {self.timeout:g} s")
@@ -225,9 +111,17 @@ class PromptRequestHandler(RequestHandler):
         def account() -> None:
             server.on_ended(association)
 
+        def end() -> None:
+            bounded.speaking.over()
+            account()
+
+        def refused(message: Any, refusal: Refusal) -> None:
+            server.on_not_offered(association, message, refusal)
+
         Hearing(association, bounded, account)
+        bounded.speaking = Speaking(association, server.message_timeout_s, refused)
         dul.run = _caught(dul.run, bounded)
-        association.run = _accounted(_caught(association.run, bounded), account)
+        association.run = _accounted(_caught(association.run, bounded, association.abort), end)
         association.bind(evt.EVT_PDU_SENT, _stop_waiting)
         return association
 
@@ -241,17 +135,39 @@ def _stop_waiting(event: Event) -> None:
         event.assoc.dul.to_user_queue.put(None)
 
 
-def _caught(run: Callable[[], None], sock: BoundedSocket) -> Callable[[], None]:
-    """A thread of an association; what nobody has foreseen ends the association with a reason."""
+def _caught(
+    run: Callable[[], None], sock: BoundedSocket, end: Callable[[], None] = lambda: None
+) -> Callable[[], None]:
+    """A thread of an association; what nobody has foreseen ends the association with a reason.
+
+    end: ends what does not end by itself with this thread.
+    """
 
     def run_to_the_end() -> None:
         try:
             run()
         except Exception as error:
+            # what was just being said when the connection ended comes out of turn for pynetdicom
+            is_foreseen = isinstance(error, InvalidEventError) and sock.why_ended is not None
             sock.note_ending("internal_error", f"ended by an error here ({error!r})")
-            log.debug("the thread of an association", exc_info=True)
+            (log.debug if is_foreseen else log.error)("thread of an association", exc_info=True)
+            with contextlib.suppress(Exception):
+                end()
 
     return run_to_the_end
+
+
+class _Tracebacks(logging.Handler):
+    """Errors that pynetdicom catches by itself: they are in our log, with their tracebacks."""
+
+    def emit(self, record: logging.LogRecord) -> None:
+        error = record.exc_info[1] if record.exc_info else None
+        if error is not None and not isinstance(error, (OSError, InvalidEventError)):
+            log.error("pynetdicom", text=record.getMessage(), exc_info=error)
+
+
+def keep_tracebacks() -> None:
+    logging.getLogger("pynetdicom").addHandler(_Tracebacks(logging.ERROR))
 
 
 def _accounted(run: Callable[[], None], account: Callable[[], None]) -> Callable[[], None]:
@@ -282,6 +198,7 @@ class PromptServer(ThreadedAssociationServer):
     on_dropped: Callable[[str, str], None] = staticmethod(lambda peer, why: None)
     on_no_request: Callable[[str, str], None] = staticmethod(lambda peer, why: None)
     on_ended: Callable[[Association], None] = staticmethod(lambda association: None)
+    on_not_offered: Callable[[Association, Any, Refusal], None] = staticmethod(lambda *what: None)
 
     def __init__(self, *args: Any, **kwargs: Any) -> None:
         self._lobby = Lobby(self.most_unopened)
@@ -353,6 +270,8 @@ class PromptServer(ThreadedAssociationServer):
         self.server_close()
 
     def handle_error(self, request: Any, client_address: Any) -> None:
+        if not isinstance(sys.exception(), OSError):
+            log.error("start of an association", peer=client_address[0], exc_info=True)
         self.on_dropped(client_address[0], "failed to start an association")
 
 

@@ -24,6 +24,7 @@ class Localization:
     psf: point spread of the fit; None where the object's own image was fitted.
     systematic_px: std (row, col) of what is common to all poses, beside covariance_px2: it cancels
       between places seen by the same method, and counts where the centre itself does: sigma_px.
+    common_px: std (row, col) of that part of covariance_px2 that no other look averages out.
     """
 
     centre_px: Array
@@ -39,6 +40,7 @@ class Localization:
     residuals_px: Array
     psf: Psf | None
     systematic_px: Array | None = None
+    common_px: Array | None = None
 
     @property
     def sigma_px(self) -> Array:

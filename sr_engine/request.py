@@ -225,9 +225,9 @@ def _found_as_disc(
         _refuse_outside(found, expected_px, gate_px, mean_mm)
     if found.systematic_px is not None:
         # a calibration by discs knows no common part, so it counts in full, for any target
-        common = np.diag(np.square(found.systematic_px))
-        whole = found.covariance_px2 + common
-        found = replace(found, covariance_px2=whole, systematic_px=None)
+        common = found.systematic_px
+        whole = found.covariance_px2 + np.diag(np.square(common))
+        found = replace(found, covariance_px2=whole, systematic_px=None, common_px=common)
     return found
 
 

@@ -59,17 +59,18 @@ def describe_result(frames: Frames, answer: Found) -> dict[str, Any]:
             "spacing_mm": list(geometry.spacing_mm),
         },
         "scan_s": sum(_scan_s(row.header) for row in frames.slices),
-        **_common_part(found, spacing),
+        **_in_mm("systematic_mm", found.systematic_px, spacing),
+        **_in_mm("common_mm", found.common_px, spacing),
         **({} if answer.learnt is None else {TEMPLATE: _described(answer.learnt)}),
         **({} if not answer.why_not else {"why_no_template": answer.why_not}),
     }
 
 
-def _common_part(found: Localization, spacing_mm: NDArray[np.float64]) -> dict[str, Any]:
-    """What is common to all places found so, std mm (row, col): see `Localization`."""
-    if found.systematic_px is None:
-        return {}
-    return {"systematic_mm": (np.asarray(found.systematic_px) * spacing_mm).tolist()}
+def _in_mm(
+    name: str, std_px: NDArray[np.float64] | None, spacing_mm: NDArray[np.float64]
+) -> dict[str, Any]:
+    """What is common to several places, std (row, col): see `Localization`."""
+    return {} if std_px is None else {name: (np.asarray(std_px) * spacing_mm).tolist()}
 
 
 def _described(learnt: Learnt) -> dict[str, Any]:

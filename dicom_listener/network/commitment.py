@@ -1,8 +1,8 @@
 """Storage Commitment (push model, SCP): consoles ask whether what they sent is safe here.
 
 PS3.4 annex J. An instance is committed to if its file lies in an inbox, whole by its hash. The
-report goes out on the same association where that still stands, else on a new one to where the
-configuration says that the asking AE listens.
+report goes out on the same association where that still stands, else (or where it is not answered
+there) on a new one to where the configuration says that the asking AE listens.
 """
 
 import threading
@@ -15,7 +15,6 @@ from typing import Any
 import structlog
 from pydicom.dataset import Dataset
 from pynetdicom import AE, build_role
-from pynetdicom.association import Association
 from pynetdicom.sop_class import (
     StorageCommitmentPushModel,
     StorageCommitmentPushModelInstance,
@@ -27,9 +26,10 @@ from dicom_listener.inbox import NotFromInboxError, is_whole, read_envelope
 REQUEST = 1
 _ALL_SAFE, _SOME_FAILED = 1, 2
 _NO_SUCH_INSTANCE, _CLASS_CONFLICT = 0x0112, 0x0119
-_NO_SUCH_ACTION, _INVALID = 0x0123, 0x0115
+_NO_SUCH_ACTION, _INVALID, _RESOURCE_LIMITATION = 0x0123, 0x0115, 0x0213
+_MOST_UNREPORTED = 32
 _LOOK_AGAIN_S = 0.5
-_REPORT_AFTER_S = 0.1  # the answer to the request goes out first
+_REPORT_AFTER_S = 0.1  # a console may still be busy with the answer to its request
 
 log = structlog.get_logger("listener")
 
@@ -97,16 +97,27 @@ class Commitment:
     ae_title: str
     reports_to: Mapping[str, tuple[str, int]] = field(default_factory=dict)
     on_unreported: Callable[[str], None] = lambda text: None
+    _places: threading.Semaphore = field(
+        default_factory=lambda: threading.Semaphore(_MOST_UNREPORTED)
+    )
 
-    def answer(self, association: Association, action: int, asked: Dataset) -> int:
-        """The status of an N-ACTION; the report follows by itself."""
+    def answer(
+        self, who: str, action: int, asked: Dataset, tell: Callable[[int, Dataset], str]
+    ) -> int:
+        """The status of an N-ACTION; the report follows by itself.
+
+        who: the AE title that asks. tell: sends (event type, event information) on its association,
+        waits, and returns why that was not taken; empty where it was.
+        """
         if action != REQUEST:
             return _NO_SUCH_ACTION
         if not asked.get("TransactionUID") or not asked.get("ReferencedSOPSequence"):
             return _INVALID
+        if not self._places.acquire(blocking=False):
+            return _RESOURCE_LIMITATION  # a console that answers no report asks on and on
         name = f"commitment {asked.TransactionUID}"
         threading.Thread(
-            target=self._report, args=(association, asked), name=name, daemon=True
+            target=self._report, args=(who, asked, tell), name=name, daemon=True
         ).start()
         return 0x0000
 
@@ -140,18 +151,18 @@ class Commitment:
             report.FailedSOPSequence = failed
         return (_SOME_FAILED if failed else _ALL_SAFE), report
 
-    def _report(self, association: Association, asked: Dataset) -> None:
-        who = str(association.requestor.ae_title).strip()
+    def _report(self, who: str, asked: Dataset, tell: Callable[[int, Dataset], str]) -> None:
         try:
             event, report = self.report_on(asked)
             time.sleep(_REPORT_AFTER_S)
-            if association.is_established and _was_taken(association, event, report):
+            why_not = tell(event, report)
+            if not why_not or (who in self.reports_to and self._on_a_new_one(who, event, report)):
                 return
-            if who in self.reports_to and self._on_a_new_one(who, event, report):
-                return
-            text = f"{who} could not be informed of transaction {asked.TransactionUID}"
+            text = f"{who} could not be informed of transaction {asked.TransactionUID}: {why_not}"
         except Exception as error:  # whatever the peer does: it is told of it, or we say so
             text = f"{who} could not be informed of what is stored safely: {error}"
+        finally:
+            self._places.release()
         self.on_unreported(text)
 
     def _on_a_new_one(self, who: str, event: int, report: Dataset) -> bool:
@@ -162,15 +173,11 @@ class Commitment:
         association = mended(entity.associate(host, port, ae_title=who, ext_neg=[role]))
         if not association.is_established:
             return False
+        answer: Any
         try:
-            return _was_taken(association, event, report)
+            answer, _ = association.send_n_event_report(
+                report, event, StorageCommitmentPushModel, StorageCommitmentPushModelInstance
+            )
+            return "Status" in answer and answer.Status == 0x0000
         finally:
             association.release()
-
-
-def _was_taken(association: Association, event: int, report: Dataset) -> bool:
-    answer: Any
-    answer, _ = association.send_n_event_report(
-        report, event, StorageCommitmentPushModel, StorageCommitmentPushModelInstance
-    )
-    return "Status" in answer and answer.Status == 0x0000

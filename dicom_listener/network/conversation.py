@@ -20,6 +20,7 @@ PDU_NAMES = {
     ABORT: "an abort",
 }
 C_STORE, C_ECHO, N_EVENT_REPORT, N_ACTION, C_CANCEL = 0x0001, 0x0030, 0x0100, 0x0130, 0x0FFF
+N_SERVICES_FROM = N_EVENT_REPORT
 _RESPONSE = 0x8000
 _COMMAND_NAMES = {
     C_STORE: "C-STORE",
@@ -37,6 +38,7 @@ _COMMAND_NAMES = {
 }
 _NO_DATA_SET = 0x0101
 _AFFECTED_CLASS, _REQUESTED_CLASS, _FIELD, _DATA_SET_TYPE = 0x0002, 0x0003, 0x0100, 0x0800
+_ANSWERED = 0x0120  # message ID being responded to
 _LONGEST_COMMAND = 64 * 1024
 
 
@@ -80,12 +82,16 @@ def check_turn(kind: int, phase: Phase) -> None:
 
 @dataclass(frozen=True)
 class Command:
-    """The command of one message, as far as it decides whether it is served."""
+    """The command of one message, as far as it decides whether it is served.
+
+    answers: the ID of the message that a response is to.
+    """
 
     field: int
     sop_class: str
     context: int
     has_data_set: bool
+    answers: int | None = None
 
     @property
     def is_response(self) -> bool:
@@ -97,6 +103,10 @@ class Command:
         return self.field == N_EVENT_REPORT | _RESPONSE
 
     @property
+    def is_known(self) -> bool:
+        return self.field & ~_RESPONSE in _COMMAND_NAMES
+
+    @property
     def name(self) -> str:
         """As in "a C-STORE"; starts with its article."""
         known = _COMMAND_NAMES.get(self.field & ~_RESPONSE)
@@ -106,8 +116,13 @@ class Command:
         return f"{article} {known}{' response' if self.field & _RESPONSE else ''}"
 
 
+def field_named(name: str) -> int:
+    """Of a request, as in `C-STORE`. KeyError where there is none."""
+    return {known: number for number, known in _COMMAND_NAMES.items()}[name]
+
+
 class Conversation:
-    """Of one association. why_not_served: of a command, the reason; empty where it is served."""
+    """Of one association. why_not_served: of a command that nothing can answer; else empty."""
 
     def __init__(self, why_not_served: Callable[[Command], str]) -> None:
         self._why_not_served = why_not_served
@@ -197,4 +212,5 @@ def read_command(encoded: bytes, context: int) -> Command:
         sop_class.rstrip(b"\0 ").decode("ascii", "replace"),
         context,
         int.from_bytes(data_set_type, "little") != _NO_DATA_SET,
+        int.from_bytes(values[_ANSWERED], "little") if _ANSWERED in values else None,
     )

@@ -22,7 +22,7 @@ from dicom_listener.network.conversation import (
     Phase,
     check_turn,
 )
-from dicom_listener.network.services import why_not_served
+from dicom_listener.network.services import accepted_by, refusal_of
 
 _HEAD_BYTES = 6
 # the state machine's names: of a connection that is gone, of a PDU that may not be, of states
@@ -46,7 +46,7 @@ class Hearing:
     def __init__(self, association: Any, sock: Any, account: Callable[[], None]) -> None:
         self._association, self._sock, self._account = association, sock, account
         self._conversation = Conversation(self._why_not_served)
-        self._reports_out = 0
+        self._reports_out: set[int] = set()  # their message IDs
         self._is_asked = False
         self._is_over = False  # what comes after its end is not looked at
         association.bind(evt.EVT_DIMSE_SENT, self._on_sent)
@@ -123,13 +123,13 @@ class Hearing:
         return request, event
 
     def _on_sent(self, event: Event) -> None:
-        self._reports_out += event.message.command_set.CommandField == N_EVENT_REPORT
+        command = event.message.command_set
+        if command.CommandField == N_EVENT_REPORT:
+            self._reports_out.add(command.MessageID)
 
     def _why_not_served(self, command: Command) -> str:
-        accepted = {
-            number: str(context.abstract_syntax)
-            for number, context in self._association._accepted_cx.items()
-        }
-        is_awaited = command.is_report_response and self._reports_out > 0
-        self._reports_out -= is_awaited
-        return "" if is_awaited else why_not_served(command, accepted)
+        if command.is_report_response and command.answers in self._reports_out:
+            self._reports_out.discard(command.answers)
+            return ""
+        refusal = refusal_of(command, accepted_by(self._association))
+        return refusal.why if refusal is not None and refusal.status is None else ""

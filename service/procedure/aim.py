@@ -156,7 +156,6 @@ def frames_that_decide(
     The bound scales as one over their number; the error found so far is taken as the error.
     """
     for frames in range(present, most + 1):
-        fewer = replace(estimate, covariance_mm2=estimate.covariance_mm2 * (present / frames))
-        if is_sure(fewer):
+        if is_sure(estimate.with_noise_times(present / frames)):
             return frames
     return present

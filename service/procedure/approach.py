@@ -221,7 +221,7 @@ def _believing(standing: Standing, here: Observation, *, fuses: bool) -> Standin
     """What is believed after a look: it alone, or with all that was believed before it."""
     estimate = here.found
     if fuses:
-        estimate = here.prior.fused_with(estimate.plane_mm, estimate.covariance_mm2)
+        estimate = here.prior.fused_with(estimate)
     calibration = replace(
         standing.calibration, estimate=estimate, measurement_id=here.seen.measurement_id
     )

@@ -59,10 +59,10 @@ def geometry_of(guide: GuideConfig) -> GuideGeometry:
 def calibration_of(
     config: Config, guide: GuideConfig | None, travel: Mapping[str, Travel], seed: int
 ) -> CalibrationArguments:
-    """Every axis from the middle of its travel; raises PlanRefusedError where that cannot be."""
+    """Every axis from its `calibration_origin_um`; raises PlanRefusedError where that cannot be."""
     driven = guide or config.service
-    origin_um = {axis: (t.min_um + t.max_um) // 2 for axis, t in travel.items()}
     move_um = round(driven.calibration_move_mm * 1000)
+    origin_um = {axis: calibration_origin_um(t, move_um) for axis, t in travel.items()}
     check_travel({axis: origin_um.get(axis, 0) + move_um for axis in driven.axes}, travel)
     return CalibrationArguments(
         axes=tuple(driven.axes),
@@ -73,6 +73,13 @@ def calibration_of(
         localization=config.imaging.localization,
         geometry=geometry_of(guide) if guide else ONE_FIDUCIAL,
     )
+
+
+def calibration_origin_um(travel: Travel, move_um: int) -> int:
+    """The middle of an axis's travel, or as near to it as leaves room for the move."""
+    low_um, high_um = travel.min_um - min(move_um, 0), travel.max_um - max(move_um, 0)
+    middle_um = (travel.min_um + travel.max_um) // 2
+    return min(max(middle_um, low_um), high_um) if low_um <= high_um else middle_um
 
 
 def approach_of(

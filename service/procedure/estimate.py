@@ -7,7 +7,7 @@ measured from the patient origin, so that they survive another field of view.
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -38,12 +38,22 @@ class MotionNoise:
 class FiducialEstimate:
     """Position (2,) and covariance (2, 2) in the image plane, at the given setpoints.
 
+    common_mm: std (2,) of the part of the covariance that is the same at every look (what draws
+    the centre of a disc that is none), so that fusing looks does not lessen it; none by default.
     Of two fiducials: (4,) and (4, 4), the first one's pair first.
     """
 
     setpoints_um: Mapping[str, int]
     plane_mm: Array
     covariance_mm2: Array
+    common_mm: Array | None = None
+
+    @property
+    def noise_mm2(self) -> Array:
+        """The part of covariance_mm2 that further looks lessen."""
+        if self.common_mm is None:
+            return self.covariance_mm2
+        return np.asarray(self.covariance_mm2 - np.diag(np.square(self.common_mm)))
 
     @property
     def each(self) -> list[slice]:
@@ -62,16 +72,33 @@ class FiducialEstimate:
             dict(setpoints_um),
             self.plane_mm + displacement,
             self.covariance_mm2 + covariance + motion_covariance(change_mm, jacobian, noise),
+            self.common_mm,
         )
 
-    def fused_with(self, plane_mm: Array, covariance_mm2: Array) -> FiducialEstimate:
-        """Combine the prediction with a measurement at the same setpoints."""
-        gain = np.linalg.solve(self.covariance_mm2 + covariance_mm2, self.covariance_mm2).T
+    def fused_with(self, found: FiducialEstimate) -> FiducialEstimate:
+        """Combine the prediction with what was found at the same setpoints.
+
+        What both have in common is no second witness: they are weighed by the rest, and it stays.
+        """
+        common = [
+            np.zeros(len(x.plane_mm)) if x.common_mm is None else x.common_mm for x in (self, found)
+        ]
+        shared = np.diag(np.square(np.minimum(*common)))
+        own, its = self.covariance_mm2 - shared, found.covariance_mm2 - shared
+        gain = np.linalg.solve(own + its, own).T
         rest = np.eye(len(gain)) - gain
-        fused = rest @ self.covariance_mm2 @ rest.T + gain @ covariance_mm2 @ gain.T
+        common_mm = np.abs(rest) @ common[0] + np.abs(gain) @ common[1]
+        noise_mm2 = rest @ self.noise_mm2 @ rest.T + gain @ found.noise_mm2 @ gain.T
         return FiducialEstimate(
-            self.setpoints_um, self.plane_mm + gain @ (plane_mm - self.plane_mm), fused
+            self.setpoints_um,
+            self.plane_mm + gain @ (found.plane_mm - self.plane_mm),
+            noise_mm2 + np.diag(np.square(common_mm)),
+            common_mm if np.any(common_mm) else None,
         )
+
+    def with_noise_times(self, factor: float) -> FiducialEstimate:
+        """As if so many times the noise (in power) were in it; what is common stays."""
+        return replace(self, covariance_mm2=self.covariance_mm2 + (factor - 1) * self.noise_mm2)
 
     def distance_sigma(self, plane_mm: Array, covariance_mm2: Array) -> float:
         """How many standard deviations a measurement is away from this prediction."""
@@ -84,12 +111,16 @@ class FiducialEstimate:
             "setpoints_um": dict(self.setpoints_um),
             "plane_mm": self.plane_mm.tolist(),
             "covariance_mm2": self.covariance_mm2.tolist(),
+            **({} if self.common_mm is None else {"common_mm": self.common_mm.tolist()}),
         }
 
     @classmethod
     def from_json(cls, value: Mapping[str, Any]) -> FiducialEstimate:
         return cls(
-            value["setpoints_um"], np.array(value["plane_mm"]), np.array(value["covariance_mm2"])
+            value["setpoints_um"],
+            np.array(value["plane_mm"]),
+            np.array(value["covariance_mm2"]),
+            np.array(value["common_mm"]) if "common_mm" in value else None,
         )
 
 

@@ -284,10 +284,12 @@ def estimate_from(
     measured: Sequence[Measured | SeenBefore], setpoints_um: Mapping[str, int]
 ) -> FiducialEstimate:
     """What measurements of each fiducial say by themselves."""
+    common_mm = np.ravel([getattr(one, "common_mm", (0.0, 0.0)) for one in measured])
     return FiducialEstimate(
         dict(setpoints_um),
         np.concatenate([one.plane_mm for one in measured]),
         block_diag(*(one.covariance_mm2 for one in measured)),
+        common_mm if np.any(common_mm) else None,
     )
 
 

@@ -101,7 +101,7 @@ def record_place(arguments: RecordingArguments, start: Calibration) -> Procedure
         wanted = _slices_for(arguments, here)
         if wanted > here.seen.frames_of_each:
             here = yield from look_longer(here, geometry, gate, frames=wanted)
-        estimate = here.prior.fused_with(here.found.plane_mm, here.found.covariance_mm2)
+        estimate = here.prior.fused_with(here.found)
     return _place(arguments, start, estimate, here)
 
 

@@ -120,6 +120,7 @@ class Measured:
     after_loss: a try before it, at the same place, did not find the fiducial. method: that
     answered. systematic_mm: std (row, col) of what is common to all places found so. own_mm: of
     that, how well the template's own place is known; views: of the measurements it is learnt from.
+    common_mm: std of the part of covariance_mm2 that other looks do not average out.
     """
 
     measurement_id: int
@@ -135,6 +136,7 @@ class Measured:
     systematic_mm: tuple[float, float] = (0.0, 0.0)
     own_mm: tuple[float, float] = (0.0, 0.0)
     views: tuple[SeenBefore, ...] = ()
+    common_mm: tuple[float, float] = (0.0, 0.0)
 
     @property
     def ok(self) -> bool:
@@ -191,7 +193,7 @@ def outcome_from_json(kind: str, value: Mapping[str, Any]) -> Outcome:
         fields["plane_mm"] = (first, second)
         (a, b), (c, d) = fields["covariance_mm2"]
         fields["covariance_mm2"] = ((a, b), (c, d))
-        for name in ("systematic_mm", "own_mm"):
+        for name in ("systematic_mm", "own_mm", "common_mm"):
             fields[name] = tuple(fields.get(name, (0.0, 0.0)))
         fields["views"] = tuple(seen_before(view) for view in fields.get("views", ()))
     return _OUTCOMES[kind](**fields)

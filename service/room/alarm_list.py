@@ -26,11 +26,13 @@ TO_DO = {
     "late_or_clock_jump": "Compare the scanner clock again, then acquire the slices again.",
     "many_slices_wait": "Send only what is asked for; compare the clocks.",
     "message_ignored": "Nothing is lost; see what the scanner sends besides slices.",
+    "not_offered": "Nothing is lost; the scanner asked for a service that is not offered.",
     "oversize": "Check what the scanner is sending: no slice is that large.",
     "plan_refused": "Correct the plan at the workstation and send it again.",
     "plans_too_many": "Check that the proposal shown is the plan that is meant.",
     "push_delay_unlike_measured": "Compare the clocks; if it persists, commission the site again.",
     "same_uid_other_bytes": "Acquire the slice again; check which systems send to this listener.",
+    "sends_ahead": "Nothing is lost. Set the scanner to wait for each answer, if it can.",
     "slice_refused": "Send or acquire the slice again.",
     "unfinished_files": "Nothing is lost: the scanner was never told that they had arrived. Send "
     "them again.",

@@ -128,5 +128,5 @@ class RoomContext:
         return stood and is_proven(self.record, start, self.linked().positions_um)
 
     def proof_arguments(self, start: Calibration) -> ProofArguments:
-        confirm, travel_um = self.config.service.confirm_moves, self.link.travel_um
+        confirm, travel_um = self.config.service.confirm_moves, self.link.travel_left_um
         return ProofArguments(self.is_proven(start), dict(travel_um), confirm)

@@ -61,13 +61,15 @@ class RoomLink:
     def travel_left_um(self) -> dict[str, tuple[int, int]]:
         """By axis, the counts at which it is sure to be within its travel.
 
-        A count is off by what images last said of it, and known to within a bound only.
+        A count is off by what images last said of it, and known to within a bound only. The bridge
+        refuses counts beyond the travel, wherever they truly are.
         """
         status, left = self.status, dict(self.travel_um)
         for axis, bound_um in (status.bound_um if status else {}).items():
             if status and axis in left and axis in status.certain_axes:
                 (low_um, high_um), off_um = left[axis], status.correction_um.get(axis, 0)
-                left[axis] = (low_um + bound_um - off_um, high_um - bound_um - off_um)
+                least_um, most_um = low_um + bound_um - off_um, high_um - bound_um - off_um
+                left[axis] = (max(low_um, least_um), min(high_um, most_um))
         return left
 
     def pump(self, wait_s: float) -> None:

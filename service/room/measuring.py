@@ -50,6 +50,7 @@ def measured_from_result(measurement_id: int, result: Mapping[str, Any]) -> Meas
         systematic_mm=_pair(result.get("systematic_mm")),
         own_mm=_pair(result.get("template", {}).get("sigma_mm")),
         views=tuple(seen_before(view) for view in result.get("template", {}).get("views", ())),
+        common_mm=_pair(result.get("common_mm")),
     )
 
 

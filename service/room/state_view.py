@@ -11,6 +11,8 @@ from case_record.presence import who_is_alive
 from case_record.record import CaseRecord
 from case_record.rows import Measurement, Procedure, SliceRow
 from room_config.load import Config
+from service.procedure.arguments import calibration_origin_um
+from service.procedure.plan import Travel
 from service.procedure.targets import (
     Target,
     TargetError,
@@ -316,10 +318,10 @@ def _drives(config: Config, link: RoomLink) -> list[DriveState]:
     move_mm = (guide or config.service).calibration_move_mm
     drives = []
     for axis in axes:
-        low_um, high_um = link.travel_um.get(axis, (0, 0))
-        middle_mm = (low_um + high_um) // 2 / 1000
-        stops_mm = (status.positions_um.get(axis, 0) / 1000, middle_mm, middle_mm + move_mm)
-        drives.append(DriveState(axis=axis, stops_mm=(*stops_mm, middle_mm)))
+        travel = Travel(*link.travel_left_um.get(axis, (0, 0)))
+        origin_mm = calibration_origin_um(travel, round(move_mm * 1000)) / 1000
+        stops_mm = (status.positions_um.get(axis, 0) / 1000, origin_mm, origin_mm + move_mm)
+        drives.append(DriveState(axis=axis, stops_mm=(*stops_mm, origin_mm)))
     return drives
 
 

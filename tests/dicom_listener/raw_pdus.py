@@ -54,10 +54,13 @@ def store_command(uid: str, *, priority: int = 0) -> bytes:
     return element(0, struct.pack("<L", len(fields))) + fields
 
 
-def command(field: int, *, sop_class: str = MR_IMAGE, has_data: bool = False) -> bytes:
-    """A command of any kind; its class as the affected one."""
+def command(
+    field: int, *, sop_class: str = MR_IMAGE, has_data: bool = False, number: int = 1
+) -> bytes:
+    """A command of any kind; its class as the affected one. number: the message's, or answered."""
     fields = element(0x0002, sop_class.encode()) + element(0x0100, struct.pack("<H", field))
-    fields += element(0x0120 if field & 0x8000 or field == 0x0FFF else 0x0110, b"\1\0")
+    is_about_another = field & 0x8000 or field == 0x0FFF
+    fields += element(0x0120 if is_about_another else 0x0110, struct.pack("<H", number))
     fields += element(0x0700, b"\0\0") + element(0x0800, b"\0\0" if has_data else b"\1\1")
     if field & 0x8000:
         fields += element(0x0900, b"\0\0")
@@ -85,6 +88,12 @@ def answer(sock: socket.socket) -> tuple[int, bytes]:
         return 0, b""
     kind, _, size = struct.unpack(">BBL", head)
     return kind, sock.recv(size, socket.MSG_WAITALL)
+
+
+def command_of(body: bytes) -> int:
+    """The kind of command in a P-DATA body."""
+    at = body.index(struct.pack("<HHL", 0, 0x0100, 2))
+    return int(struct.unpack_from("<H", body, at + 8)[0])
 
 
 def status_of(body: bytes) -> int:

@@ -1,6 +1,7 @@
 """Storage Commitment: a console asks what is safe, and is told on the same or a new association."""
 
 import contextlib
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -28,8 +29,10 @@ class Console:
 
     def __init__(self) -> None:
         self.reports: list[tuple[int, Dataset]] = []
+        self._answering: list[threading.Thread] = []
 
     def on_report(self, event: evt.Event) -> tuple[int, None]:
+        self._answering.append(threading.current_thread())
         self.reports.append((event.event_type, event.event_information))
         return 0x0000, None
 
@@ -47,6 +50,8 @@ class Console:
             asked, 1, StorageCommitmentPushModel, StorageCommitmentPushModelInstance
         )
         yield answer.Status
+        for thread in self._answering:  # until then pynetdicom may say that nothing is paused
+            thread.join()
         association.release()
 
     def references(self, name: str) -> list[str]:

@@ -193,7 +193,6 @@ def test_a_message_that_cannot_be_read_ends_the_association_with_a_line(tmp_path
 
 
 DATA_SET = encoded(mr_data_set("1.2.3"))
-FIND = "1.2.840.10008.5.1.4.1.2.2.1"
 TWO_PARTS = struct.pack(">LBB", len(command(0x30)) + 2, 1, 3) + command(0x30)
 
 
@@ -208,26 +207,12 @@ TWO_PARTS = struct.pack(">LBB", len(command(0x30)) + 2, 1, 3) + command(0x30)
         ),
         (p_data(1, store_command("1.2.3")[:30]) + RELEASE, "unfinished", "released, in the middle"),
         (p_data(3, command(0x7777)), "not_offered", "an unknown command (0x7777), which is not of"),
-        (p_data(3, command(0x0150)), "not_offered", "an N-DELETE, which is not offered here"),
-        (p_data(3, command(0x0020, has_data=True)), "not_offered", "a C-FIND, which is not offere"),
-        (p_data(3, command(0x0130)), "not_offered", "an N-ACTION, which is not offered here"),
-        (p_data(3, command(0x0100)), "not_offered", "an N-EVENT-REPORT, which is not offered here"),
         (p_data(3, command(0x8001)), "not_offered", "a C-STORE response without a request"),
         (p_data(3, command(0x8100)), "not_offered", "an N-EVENT-REPORT response without a req"),
         (
             p_data(3, store_command("1.2.3"), 5) + p_data(2, DATA_SET, 5),
             "not_offered",
             "a C-STORE on presentation context 5, which was not accepted",
-        ),
-        (
-            p_data(3, command(1, sop_class=FIND, has_data=True)) + p_data(2, DATA_SET),
-            "not_offered",
-            "a C-STORE of Study Root Query/Retrieve Information Model - FIND, an object type that",
-        ),
-        (
-            p_data(3, command(1, sop_class="1.2.3.4", has_data=True)) + p_data(2, DATA_SET),
-            "not_offered",
-            "a C-STORE of 1.2.3.4, which was not proposed",
         ),
         (p_data(2, DATA_SET), "out_of_turn", "a data set without a command"),
         (p_data(0, DATA_SET[:100]), "out_of_turn", "a data set without a command"),

@@ -30,8 +30,8 @@ from dicom_listener.association_fix import mended
 from dicom_listener.inbox import Inbox, data_set_bytes, is_whole, read_envelope
 from dicom_listener.metrics import ListenerMetrics
 from dicom_listener.negotiation import VERIFICATION
+from dicom_listener.network.bounded_socket import acknowledge_at_once
 from dicom_listener.scp import Scp, ScpRules, tls_context
-from dicom_listener.transport import acknowledge_at_once
 from dicom_slice.quirks import MR_CLASSES, MR_IMAGE
 
 FOLDER = DICOM / "hazen" / "nist_T2_site4_philips_plate5"
@@ -43,10 +43,11 @@ class Serving:
 
     def __init__(self, folder: Path, tls: ssl.SSLContext | None = None, **rules) -> None:
         min_free_bytes = rules.pop("min_free_bytes", 0)
+        asked = rules.pop("commitment", None)
         self.inbox = Inbox(folder / "inbox", min_free_bytes=min_free_bytes)
         self.metrics = ListenerMetrics()
         self.stored: list[Path] = []
-        self.scp = Scp(ScpRules(**rules), self.inbox, self.metrics, self.stored.append, tls)
+        self.scp = Scp(ScpRules(**rules), self.inbox, self.metrics, self.stored.append, tls, asked)
         self.scp.start()
         self.port = self.scp.port
 
@@ -429,7 +430,7 @@ def test_a_sender_with_nagles_algorithm_is_not_held_up(tmp_path):
 
 
 def test_where_quickack_does_not_exist_it_is_not_set(monkeypatch):
-    monkeypatch.setattr("dicom_listener.transport._QUICKACK", None)
+    monkeypatch.setattr("dicom_listener.network.bounded_socket._QUICKACK", None)
     with socket.socket() as sock:
         acknowledge_at_once(sock)
 

@@ -55,9 +55,35 @@ def test_fusion_is_the_information_weighted_mean(row, col, a, b, c):
     spread = covariance(c, c)
     information = np.linalg.inv(prior.covariance_mm2), np.linalg.inv(spread)
     expected_covariance = np.linalg.inv(information[0] + information[1])
-    fused = prior.fused_with(seen, spread)
+    fused = prior.fused_with(FiducialEstimate(HERE, seen, spread))
     assert fused.covariance_mm2 == pytest.approx(expected_covariance, rel=1e-6, abs=1e-12)
     assert fused.plane_mm == pytest.approx(expected_covariance @ information[1] @ seen, abs=1e-9)
+
+
+@given(offsets, offsets, st.lists(sigmas, min_size=3, max_size=3), sigmas)
+def test_what_all_looks_have_in_common_is_not_averaged_out(row, col, noise, common):
+    """However often somebody looks: the centre that is drawn aside is drawn aside."""
+    looks = [
+        FiducialEstimate(
+            HERE,
+            np.array([row, col]) * number,
+            covariance(spread, spread) + np.eye(2) * common**2,
+            np.full(2, common),
+        )
+        for number, spread in enumerate(noise)
+    ]
+    fused = looks[0]
+    for look in looks[1:]:
+        fused = fused.fused_with(look)
+    information = sum(spread**-2 for spread in noise)
+    expected = 1 / information + common**2
+    assert np.diag(fused.covariance_mm2) == pytest.approx([expected] * 2, rel=1e-6)
+    assert fused.with_noise_times(0).covariance_mm2 == pytest.approx(np.eye(2) * common**2)
+    # what is drawn further aside than the rest tells little, and the estimate stays sound
+    other = FiducialEstimate(HERE, np.zeros(2), np.eye(2), np.full(2, 0.9))
+    both = fused.fused_with(other)
+    assert np.all(np.linalg.eigvalsh(both.noise_mm2) >= -1e-12)
+    assert np.all(np.diag(both.covariance_mm2) >= common**2 * (1 - 1e-9))
 
 
 def test_standing_still_adds_no_uncertainty_and_a_move_adds_its_own():

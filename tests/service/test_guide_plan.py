@@ -62,6 +62,8 @@ def test_a_calibration_starts_in_the_middle_of_the_travel(tmp_path):
     arguments = calibration_of(config, config.service.guide, travel, 1)
     assert arguments.origin_um == {"xt": 0, "yt": 0, "xb": 3000, "yb": 0}
     assert arguments.move_um == 6000
+    short = {**TRAVEL, "xb": Travel(-1000, 7000)}
+    assert calibration_of(config, config.service.guide, short, 1).origin_um["xb"] == 1000
     with pytest.raises(PlanRefusedError, match="axis yb"):
         calibration_of(config, config.service.guide, {**TRAVEL, "yb": Travel(0, 4000)}, 1)
     two = {axis: TRAVEL[axis] for axis in ("xt", "yt")}

@@ -18,6 +18,7 @@ from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.uid import ExplicitVRLittleEndian, generate_uid
 from pynetdicom import AE
 from pynetdicom.sop_class import SpatialFiducialsStorage
+from station_screen import assert_shows_what_the_page_shows, beside, ras, shown_points
 
 from case_record.record import CaseRecord
 from service.client import RefusedByServiceError, RoomClient
@@ -50,47 +51,8 @@ def refuse_all(client: RoomClient) -> None:
         client.refuse_proposal(one.number)
 
 
-def beside(state: RoomState, right_mm: float) -> tuple[float, float, float]:
-    """A place beside the fiducial, LPS."""
-    assert state.measurement is not None
-    assert state.measurement.patient_mm is not None
-    x, y, z = state.measurement.patient_mm
-    return x + right_mm, y, z
-
-
-def ras(place: tuple[float, float, float]) -> str:
-    return " ".join(f"{value:.4f}" for value in np.array(place) * TO_RAS)
-
-
 def target_status(message: Any) -> bool:
     return message["kind"] == "STATUS" and message["device"] == "TARGET"
-
-
-def shown_points(screen: Station, device: str) -> dict[str, tuple[float, ...]]:
-    """LPS by name."""
-    shown = screen.shown(device)
-    listed = [] if shown is None else shown["points"]
-    return {point["name"]: tuple((np.array(point["ras"]) * TO_RAS).tolist()) for point in listed}
-
-
-def assert_shows_what_the_page_shows(screen: Station, client: RoomClient) -> None:
-    """After two more beats, a second apart: what was decided before them must be on the screen."""
-    screen.next_beats()
-    state = client.state()
-    targets = shown_points(screen, "Targets")
-    wanted = {"target": state.target_patient_mm, "entry": state.entry_patient_mm}
-    assert set(targets) == {name for name, place in wanted.items() if place is not None}
-    for name, place in targets.items():
-        assert place == pytest.approx(wanted[name], abs=1e-3)
-    fiducials = shown_points(screen, "Fiducials")
-    is_seen = state.measurement is not None and state.measurement.lost is None
-    assert bool(fiducials) == is_seen
-    for place in fiducials.values():
-        assert place == pytest.approx(state.measurement.patient_mm, abs=1e-3)
-    assert (screen.shown("NeedleGuide") is not None) == (state.ready and state.guide)
-    status = screen.shown("AutoSPINe")
-    could = state.robot.armed and not state.robot.stopped and state.robot.position_certain
-    assert (status["code"] in (1, 14)) == could
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -457,26 +419,41 @@ def test_when_a_case_ends_and_the_next_begins_nothing_of_it_is_shown_any_more(ki
             assert not shown_points(screen, "Targets")
 
 
-def test_pyigtl_plans_and_stops(room, port):
+def test_pyigtl_plans_watches_and_stops(room, port):
     """It keeps the last message of a device, and drops every STATUS."""
     pyigtl = pytest.importorskip("pyigtl", reason="pyigtl is not installed")
     with RoomClient(room.url, by="Olga") as client:
         calibrated(client)
-        target = beside(client.state(), 2.5)
+        refuse_all(client)
         planning = pyigtl.OpenIGTLinkClient("127.0.0.1", port)
+
+        def until(device: str, wanted: Callable[[Any], bool]) -> Any:
+            return wait_for(lambda: planning.wait_for_message(device, 60), wanted)
+
         try:
-            matrix = np.eye(4)
-            matrix[:3, 3] = np.array(target) * TO_RAS
-            planning.send_message(pyigtl.TransformMessage(matrix, device_name="TGT_5"))
-            acknowledged = planning.wait_for_message("ACK_5", timeout=60)
-            assert np.allclose(acknowledged.matrix, matrix, atol=1e-4)
-            assert planning.wait_for_message("REACHABLE_TARGET", timeout=60) is not None
-            one = [p for p in client.state().proposals if p.state == "open"][-1]
+            wanted = {"ENTRY": beside(client.state(), 3.0), "TARGET": beside(client.state(), 2.5)}
+            ras_mm = np.array(list(wanted.values())) * TO_RAS
+            planning.send_message(pyigtl.PointMessage(ras_mm, list(wanted), device_name="Plan"))
+            reachable = planning.wait_for_message("REACHABLE_TARGET", timeout=60)
+            assert np.allclose(reachable.matrix[:3, 3], ras_mm[1], atol=1e-3)
+            (one,) = open_proposals(client)
             client.take_proposal(one.number, in_water=False)
-            assert client.state().target_patient_mm == pytest.approx(target, abs=1e-3)
+            until(
+                "Targets",
+                lambda m: (
+                    m.names == ["target", "entry"]
+                    and np.allclose(m.positions, ras_mm[::-1], atol=1e-3)
+                ),
+            )
+
+            client.start_approach()
+            asked = wait_for(client.state, lambda s: s.question is not None, 120.0).question
+            before = planning.wait_for_message("CURRENT_POSITION", timeout=60).matrix
+            client.answer(asked.question_id, "confirm", asked.plan["plan_id"])
+            until("CURRENT_POSITION", lambda m: np.linalg.norm((m.matrix - before)[:3, 3]) > 0.5)
             planning.send_message(pyigtl.StringMessage("STOP", device_name="CMD_6"))
             assert planning.wait_for_message("ACK_6", timeout=60).string == "STOP"
-            wait_for(client.state, lambda s: s.robot.stopped)
+            wait_for(client.state, lambda s: s.robot.stopped and s.procedure is None)
         finally:
             planning.stop()
         stop_all(client)

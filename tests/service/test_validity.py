@@ -726,3 +726,27 @@ def test_what_to_do_next_has_a_name_and_what_a_calibration_drives_is_said_before
     assert room.until(lambda s: s.ready).next_action == "puncture"
     room.call("puncture")
     assert room.until(lambda s: s.punctured).next_action == "needle-out"
+
+
+@pytest.mark.parametrize("off_um", [-9000, 9000])
+def test_a_count_that_is_far_off_leaves_a_calibration_that_the_bridge_takes_and_that_was_told(
+    room, off_um
+):
+    """What is left of the travel ends where the count does, and where the axis truly would."""
+    room.calibrate()
+
+    def correct():
+        client = room.link.client
+        motion = client.status.last_motion
+        client.correct_position({"xt": off_um}, {"xt": 500}, based_on_motion=motion)
+
+    room.do(correct)
+    state = room.until(lambda s: s.calibration_drives[0].stops_mm[1] != 0.0)
+    told_mm = next(one.stops_mm for one in state.calibration_drives if one.axis == "xt")
+    room.call("start_calibration")
+    assert room.run_to_end().last_outcome == "calibration done"
+    with room.record() as record:
+        last = record.last_procedure("calibration", state="done")
+        moves = [one for one in record.steps(last.procedure_id) if one.kind == "MoveTo"]
+    driven_mm = [step.body["setpoints_um"]["xt"] / 1000 for step in moves]
+    assert driven_mm == [told_mm[1], told_mm[2], told_mm[2], told_mm[3]]

@@ -152,6 +152,7 @@ def test_in_a_room_what_draws_a_disc_counts_for_every_target() -> None:
     assert alone.systematic_px is not None
     assert np.min(alone.systematic_px) > 0
     assert found.systematic_px is None
+    assert found.common_px == pytest.approx(alone.systematic_px, rel=0.2)
     assert np.sqrt(np.diag(found.covariance_px2)) == pytest.approx(alone.sigma_px, rel=0.2)
 
 
