@@ -221,7 +221,7 @@ class Bridge:
         self._follow_motors(now_s)
 
     def _answer_late(self, answer: Answer | None) -> None:
-        if answer is not None:
+        if answer is not None and self.end.session is not None:
             self.end.answer(self._declared_for, answer)
 
     def _follow_motors(self, now_s: float) -> None:

@@ -159,8 +159,12 @@ class Campaign:
 
     def ask(self, request: Message) -> str:
         answer = self.bridge._answer(request)
-        self.tally[answer.code] += 1
-        return answer.code
+        if answer is None:  # a declaration that waits for a board: it is answered when it is done
+            while self.bridge._declaring.under_way:
+                self.run(0.02)
+        code = answer.code if answer else "declared late"
+        self.tally[code] += 1
+        return code
 
     def run(self, seconds: float) -> None:
         until_s = self.line.now_s + seconds
