@@ -87,7 +87,7 @@ class PatienceTimer(SteadyTimer):
 
     @property
     def expired(self) -> bool:
-        if self._sock.is_full:  # it is we who do not listen
+        if self._sock.unanswered:  # it waits for us, and may not even be read
             self.restart()
         is_over = super().expired
         if is_over:

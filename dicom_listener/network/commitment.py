@@ -26,7 +26,8 @@ from dicom_listener.inbox import NotFromInboxError, is_whole, read_envelope
 REQUEST = 1
 _ALL_SAFE, _SOME_FAILED = 1, 2
 _NO_SUCH_INSTANCE, _CLASS_CONFLICT = 0x0112, 0x0119
-_NO_SUCH_ACTION, _INVALID = 0x0123, 0x0115
+_NO_SUCH_ACTION, _INVALID, _RESOURCE_LIMITATION = 0x0123, 0x0115, 0x0213
+_MOST_UNREPORTED = 32
 _LOOK_AGAIN_S = 0.5
 _REPORT_AFTER_S = 0.1  # a console may still be busy with the answer to its request
 
@@ -96,6 +97,9 @@ class Commitment:
     ae_title: str
     reports_to: Mapping[str, tuple[str, int]] = field(default_factory=dict)
     on_unreported: Callable[[str], None] = lambda text: None
+    _places: threading.Semaphore = field(
+        default_factory=lambda: threading.Semaphore(_MOST_UNREPORTED)
+    )
 
     def answer(
         self, who: str, action: int, asked: Dataset, tell: Callable[[int, Dataset], str]
@@ -109,6 +113,8 @@ class Commitment:
             return _NO_SUCH_ACTION
         if not asked.get("TransactionUID") or not asked.get("ReferencedSOPSequence"):
             return _INVALID
+        if not self._places.acquire(blocking=False):
+            return _RESOURCE_LIMITATION  # a console that answers no report asks on and on
         name = f"commitment {asked.TransactionUID}"
         threading.Thread(
             target=self._report, args=(who, asked, tell), name=name, daemon=True
@@ -155,6 +161,8 @@ class Commitment:
             text = f"{who} could not be informed of transaction {asked.TransactionUID}: {why_not}"
         except Exception as error:  # whatever the peer does: it is told of it, or we say so
             text = f"{who} could not be informed of what is stored safely: {error}"
+        finally:
+            self._places.release()
         self.on_unreported(text)
 
     def _on_a_new_one(self, who: str, event: int, report: Dataset) -> bool:

@@ -113,19 +113,28 @@ def test_what_is_not_offered_is_refused_with_a_status_and_the_slice_behind_it_is
         assert server.count("alarms_total", kind=code) == 1
 
 
-def commitment(server: Serving | None = None, **keys) -> Commitment:
+def commitment(**keys) -> Commitment:
     return Commitment(KeptInstances(lambda: []), "AUTOSPINE", **keys)
 
 
-def ask(sock: socket.socket) -> int:
-    """Send a request for commitment; return its status."""
+def request_for_commitment() -> bytes:
     fields = element(0x0003, str(Push).encode()) + element(0x0100, struct.pack("<H", 0x0130))
     fields += element(0x0110, b"\1\0") + element(0x0800, b"\0\0")
     fields += element(0x1001, StorageCommitmentPushModelInstance.encode())
     fields += element(0x1008, b"\1\0")
     whole = element(0, struct.pack("<L", len(fields))) + fields
-    sock.sendall(p_data(3, whole, 3) + p_data(2, encoded(ASKED), 3))
+    return p_data(3, whole, 3) + p_data(2, encoded(ASKED), 3)
+
+
+def ask(sock: socket.socket) -> int:
+    """Send a request for commitment; return its status."""
+    sock.sendall(request_for_commitment())
     return status_of(answer(sock)[1])
+
+
+def message_id(body: bytes) -> int:
+    at = body.index(struct.pack("<HHL", 0, 0x0110, 2))
+    return int(struct.unpack_from("<H", body, at + 8)[0])
 
 
 def next_report(sock: socket.socket) -> int:
@@ -133,8 +142,7 @@ def next_report(sock: socket.socket) -> int:
     kind, body = answer(sock)
     assert (kind, command_of(body)) == (DATA, REPORT)
     assert answer(sock)[0] == DATA  # its data set
-    at = body.index(struct.pack("<HHL", 0, 0x0110, 2))
-    return int(struct.unpack_from("<H", body, at + 8)[0])
+    return message_id(body)
 
 
 def answer_report(sock: socket.socket, number: int) -> None:
@@ -202,6 +210,27 @@ def test_a_report_that_is_never_answered_is_told_once_and_costs_no_slice(tmp_pat
         text = "SCANNER could not be informed of transaction 1.2.840.1: no answer within 0.5 s"
         assert alarms(server) == [("commitment_unreported", text)]
         assert server.count("alarms_total", kind="commitment_unreported") == 1
+
+
+def test_a_console_that_asks_on_without_an_answer_to_its_reports_is_told_to_wait(tmp_path):
+    with serving(tmp_path, commitment=commitment()) as server, connected(server) as sock:
+        for _ in range(40):
+            sock.sendall(request_for_commitment())
+        statuses, numbers = [], []
+        while len(statuses) < 40:
+            kind, body = answer(sock)
+            assert kind == DATA
+            if command_of(body) == REPORT:
+                numbers.append(message_id(body))
+                assert answer(sock)[0] == DATA
+            else:
+                statuses.append(status_of(body))
+        assert statuses == [0] * 32 + [0x0213] * 8
+        answer_report(sock, numbers[0] if numbers else next_report(sock))
+        for _ in range(31):
+            answer_report(sock, next_report(sock))
+        wait_for(lambda: ask(sock) == 0)
+        assert stored(sock, "1.2.1") == 0
 
 
 @pytest.mark.parametrize(
@@ -301,12 +330,12 @@ def test_large_messages_fill_it_sooner(tmp_path):
 def test_a_sender_that_is_not_read_for_long_is_not_taken_for_silent(tmp_path):
     may_store = threading.Event()
     slice_ = p_data(3, store_command("1.2.3")) + p_data(2, DATA_SET)
-    with serving(tmp_path, network_timeout_s=0.3, dimse_timeout_s=0.3) as server:
+    with serving(tmp_path, network_timeout_s=1.0, dimse_timeout_s=1.0) as server:
         server.scp._on_stored = lambda path: may_store.wait(60)
         with connected(server, associate()) as sock:
             sock.sendall(slice_ * 40)
             wait_for(lambda: alarms(server))
-            assert not may_store.wait(1.0)
+            assert not may_store.wait(2.5)
             may_store.set()
             assert [status_of(answer(sock)[1]) for _ in range(40)] == [0] * 40
 
