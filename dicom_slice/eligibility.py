@@ -53,6 +53,8 @@ def why_not_usable(slice_: Slice, rules: SliceRules) -> SetAside | None:
 def _wrong_pixels(slice_: Slice, rules: SliceRules) -> SetAside | None:
     if slice_.samples_per_pixel != 1:
         return SetAside(Reason.COLOUR, f"{slice_.samples_per_pixel} samples per pixel: colour")
+    if slice_.photometric.startswith("PALETTE"):
+        return SetAside(Reason.COLOUR, "palette colour: the pixels are numbers of colours")
     rows, cols = slice_.shape
     if rules.most_pixels is not None and rows * cols > rules.most_pixels:
         text = f"{rows} x {cols} pixels, at most {rules.most_pixels} are used"

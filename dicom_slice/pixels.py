@@ -69,7 +69,8 @@ def frame_digests(path: Path) -> dict[int, str]:
 def _stored(data_set: FileDataset, top: Elements, frame: int) -> NDArray[np.integer]:
     if "PixelData" not in data_set and "FloatPixelData" not in data_set:
         raise UnusableError(Reason.NO_PIXELS, "no pixels in the file")
-    if (top.integer("SamplesPerPixel") or 1) != 1:
+    is_palette = top.text("PhotometricInterpretation").startswith("PALETTE")
+    if (top.integer("SamplesPerPixel") or 1) != 1 or is_palette:
         raise UnusableError(Reason.COLOUR, "a colour image, not magnitudes")
     frames = top.integer("NumberOfFrames") or 1
     if not 0 <= frame < frames:

@@ -222,7 +222,7 @@ class Bridge:
 
     def _answer_late(self, answer: Answer | None) -> None:
         if answer is not None:
-            self.end.keep_answer(self._declared_for, answer)
+            self.end.answer(self._declared_for, answer)
 
     def _follow_motors(self, now_s: float) -> None:
         status = self.motors.status

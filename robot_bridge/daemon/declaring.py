@@ -1,7 +1,7 @@
 """A declaration of positions, an axis or a few in every turn of the bridge's loop.
 
 Each axis costs a handful of answers; four of them on a slow adapter would keep a STOP waiting for a
-second. Then the request is answered when it is done, as it is repeated until then anyway.
+second. The request is answered when all are done.
 """
 
 from collections.abc import Callable

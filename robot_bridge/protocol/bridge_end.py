@@ -1,6 +1,7 @@
 """The bridge's end of the protocol: bytes in, events out, without I/O, threads or a clock.
 
-It speaks only when it is spoken to, so the line may be half duplex. A request that is repeated is
+It speaks only when it is spoken to, so the line may be half duplex. (An answer that took long may
+meet the request's repetition there; both are sent again.) A request that is repeated is
 answered with the recorded answer, never executed again.
 """
 
@@ -194,16 +195,8 @@ class BridgeEnd:
     def answer(self, sequence: int, answer: Answer) -> None:
         """Answer the request `sequence`, and keep the answer for its repetitions."""
         assert self.session is not None
-        self.keep_answer(sequence, answer)
+        self._last_answer = framing.encode(Frame(Answer.KIND, self.session, sequence, pack(answer)))
         self._send(self._last_answer)
-
-    def keep_answer(self, sequence: int, answer: Answer) -> None:
-        """Late: it goes out when the request is repeated, for we speak only when spoken to."""
-        assert self.session is not None
-        if sequence == self._last_sequence:
-            self._last_answer = framing.encode(
-                Frame(Answer.KIND, self.session, sequence, pack(answer))
-            )
 
     def send_status(self, sequence: int, status: Status) -> None:
         assert self.session is not None

@@ -86,6 +86,7 @@ def test_a_real_slice_deflated_or_inverted_gives_the_same_pixels(tmp_path):
         ({"PixelData": STORED.tobytes()[:-2]}, Reason.UNDECODABLE),
         ({"PixelData": b""}, Reason.UNDECODABLE),
         ({"SamplesPerPixel": 3}, Reason.COLOUR),
+        ({"PhotometricInterpretation": "PALETTE COLOR"}, Reason.COLOUR),
         ({"Rows": 50_000, "Columns": 50_000}, Reason.TOO_LARGE),
         ({"PixelData": bytes(48 * 40 * 2)}, Reason.BLANK),
         ({"RescaleSlope": "1e300", "RescaleIntercept": "1e300"}, None),
@@ -140,6 +141,7 @@ def test_what_is_not_dicom_is_called_so_in_one_line(tmp_path, content, text):
         ({"geometry": None, "geometry_problem": "no PixelSpacing"}, Reason.NO_GEOMETRY),
         ({"geometry": None, "geometry_problem": "off by 0.3"}, Reason.BAD_GEOMETRY),
         ({"samples_per_pixel": 3}, Reason.COLOUR),
+        ({"photometric": "PALETTE COLOR"}, Reason.COLOUR),
         ({"has_pixels": False}, Reason.NO_PIXELS),
     ],
 )

@@ -186,6 +186,8 @@ def test_h7_a_controller_that_restarts_leaves_the_position_uncertain(tmp_path: P
         assert not client.status.armed
         outcome = client.move("b", dict.fromkeys(AXES, 600), None)
         assert outcome.code in ("stop_latched", "motor_fault", "position_uncertain")
+        # until the board is set up again it is a fault, however slow this computer is
+        wait_for(lambda: client.pump(0.05) or client.status.fault is None, 60, "set up again")
         client.rearm("test")
         client.set_phase(WorkPhase.MANUAL, "test")
         outcome = client.move("c", dict.fromkeys(AXES, 600), None)
