@@ -260,6 +260,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 0
     if arguments.truth_port is None:
         parser.error("--truth-port or --board is needed")
+    scene.picture({"xt": 0.0, "yt": 0.0})  # what is worked out once, before anybody waits for it
     server = serve(scene, TruthAddress("127.0.0.1", arguments.truth_port), arguments.port)
     if arguments.exit_with_parent:
         on_parent_gone(server.shutdown)

@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
+import highdicom
 import httpx
 import numpy as np
 import pydicom
@@ -119,6 +120,8 @@ def test_dcmtk_and_highdicom_read_every_object(objects):
         if is_report:
             groups = Comprehensive3DSR.from_dataset(dataset).content.get_image_measurement_groups()
             assert len(groups) == 1
+        if dataset.Modality == "MR":
+            assert highdicom.imread(path).get_volume_geometry() is not None
 
 
 def test_every_report_is_a_series_of_its_own_and_names_itself(objects):
