@@ -54,7 +54,7 @@ class BenchOperator:
         series_uid = generate_uid()
         for instance in range(1, request.count + 1):
             taken = self.camera.acquire(source, time.time())
-            self.note(self.camera.complaint_about(taken))
+            self.note(self.camera.complaint_about(self.camera.circles_in(taken)))
             self.acquisitions += 1
             self._send(taken, series_uid, instance)
 

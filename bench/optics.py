@@ -15,8 +15,9 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from bench.config import CameraConfig, CameraConfigError, CameraError
+from bench.config import CameraConfigError, CameraError
 from bench.source import Picture, require_opencv
+from room_config.camera import CameraConfig
 
 Floats = NDArray[np.float64]
 Colour = Literal["redness", "greenness", "blueness", "grey", "dark"]

@@ -94,8 +94,8 @@ def _state(camera: BenchCamera, source: FrameSource) -> dict[str, object]:
 def _help(camera: BenchCamera, sharpness: Sharpness) -> str:
     if sharpness.overexposed > camera.config.most_overexposed:
         return "Overexposed: shorten the exposure or dim the light."
-    if sharpness.circles != 1:
-        return f"{sharpness.circles} circles in view; exactly one is needed."
+    if complaint := camera.complaint_about(sharpness.circles):
+        return f"{complaint[0].upper()}{complaint[1:]}."
     if sharpness.focus < 0.3:
         return "Soft edge: turn the lens until the focus value is highest."
     return "One sharp circle: good."

@@ -89,17 +89,16 @@ class BenchCamera:
         # what is faint beside the circle (a corner of the sheet, a shadow) is none
         return sum(contrast > _FAINT * max(contrasts) for contrast in contrasts)
 
-    def complaint_about(self, taken: BenchSlice) -> str:
+    def complaint_about(self, circles: int) -> str:
         """One line where the circle is not the one thing in view; else ''."""
-        count = self.circles_in(taken)
         low_mm, high_mm = self._room.radius_mm
-        if count == 0:
+        if circles == 0:
             return (
                 f"no circle of {low_mm:g} to {high_mm:g} mm radius in view: move the camera or the "
-                f"stages, or set camera.colour (now {self.config.colour})"
+                f"stages, or set camera.colour (now {self.config.colour}); or the scale is wrong"
             )
-        if count > 1:
-            return f"{count} circles in view: cover all but the robot's"
+        if circles > 1:
+            return f"{circles} circles in view: cover all but the robot's"
         return ""
 
     def _resampler_for(self, picture: Picture) -> Resampler:

@@ -64,7 +64,7 @@ class FrameSource:
         try:
             self.next_after(0, patience_s=_OPEN_PATIENCE_S)
         except CameraError:
-            self._stopped.set()
+            self._stop()
             raise
         return self
 
@@ -74,8 +74,16 @@ class FrameSource:
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
+        self._stop()
+
+    def _stop(self) -> None:
         self._stopped.set()
-        self._thread.join(timeout=5)
+        self._thread.join(timeout=_OPEN_PATIENCE_S)
+
+    @property
+    def hangs(self) -> bool:
+        """A driver does not come back from a read: this process cannot end as others do."""
+        return self._stopped.is_set() and self._thread.is_alive()
 
     @property
     def has_ended(self) -> bool:
@@ -137,14 +145,17 @@ class FrameSource:
     def _run(self) -> None:
         try:
             queue = QueueWatch()
-            pictures = _pictures(self._source, self._stopped)
+            pictures = _pictures(self._source, self._stopped, self._stall_s)
             for number in itertools.count(1):
                 began_s = time.monotonic()
                 picture = next(pictures, None)
                 if picture is None:
                     break
                 self._take(picture, number, queue.is_empty(began_s, time.monotonic()))
-            problem = f"camera {self._source}: no more pictures"
+            problem = (
+                f"camera {self._source}: no more pictures; a video and a folder are played once: "
+                "name a camera, or a stream"
+            )
         except CameraError as error:
             problem = str(error)
         except Exception as error:  # whatever a codec or a driver raises ends the camera, by name
@@ -183,12 +194,12 @@ class QueueWatch:
         return arrived_s - asked_s > _WAITED * period_s
 
 
-def _pictures(source: str, stopped: threading.Event) -> Iterator[Picture]:
+def _pictures(source: str, stopped: threading.Event, stall_s: float) -> Iterator[Picture]:
     files = picture_files(source)
     if files:
         yield from _paced(map(read_picture, files), _FOLDER_RATE_HZ, stopped)
         return
-    with _capture(source) as capture:
+    with _capture(source, stall_s) as capture:
         is_file = Path(source).is_file()
         frames = _frames(capture, stopped)
         rate_hz = float(capture.get(require_opencv().CAP_PROP_FPS)) or _FOLDER_RATE_HZ
@@ -235,9 +246,17 @@ def _paced(
 
 
 @contextlib.contextmanager
-def _capture(source: str) -> Iterator[Any]:
+def _capture(source: str, stall_s: float) -> Iterator[Any]:
     cv2 = require_opencv()
-    capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
+    if "://" in source:  # a stream that falls silent would hold its reader for half a minute
+        limits = {
+            cv2.CAP_PROP_OPEN_TIMEOUT_MSEC: _OPEN_PATIENCE_S,
+            cv2.CAP_PROP_READ_TIMEOUT_MSEC: stall_s,
+        }
+        flat = [number for key, limit_s in limits.items() for number in (key, int(1000 * limit_s))]
+        capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, flat)
+    else:
+        capture = cv2.VideoCapture(int(source) if source.isdecimal() else source)
     try:
         if not capture.isOpened():
             raise CameraError(
@@ -258,6 +277,6 @@ def require_opencv() -> Any:
         import cv2
     except ImportError:
         raise CameraError(
-            "the camera needs OpenCV: pip install 'autospine[bench]' (or opencv-python-headless)"
+            "the camera needs OpenCV: install the extra `bench`, or opencv-python-headless"
         ) from None
     return cv2

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel
 from pydantic_core import PydanticUndefined
@@ -17,7 +17,7 @@ from simulator.config import VirtualRoom
 HERE = Path(__file__).parent
 _HEAD = """# Configuration
 
-One TOML file a room ([example](../examples/room.toml)). It is strict: an unknown, misspelt or missing
+One TOML file a room (`examples/room.toml` is one). It is strict: an unknown, misspelt or missing
 key is an error that names the file and the key. Units are in the key names.
 `autospine check-config FILE` checks a file without starting anything.
 
@@ -78,8 +78,9 @@ def render() -> str:
     """Return the whole page."""
     parts = [_HEAD]
     for name, field in Config.model_fields.items():
-        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            parts.append(f"\n## `[{name}]`\n\n{_table(field.annotation)}")
+        for model in get_args(field.annotation) or (field.annotation,):
+            if isinstance(model, type) and issubclass(model, BaseModel):
+                parts.append(f"\n## `[{name}]`\n\n{_table(model)}")
     parts.append(f"\n## `[imaging.point_spread]`\n\n{_table(PointSpreadConfig)}")
     parts.append(f"\n## `[service.guide]`\n\n{GUIDE_TEXT}\n\n{_table(GuideConfig)}")
     parts.append(f"\n## `[[service.token]]`\n\n{_table(AccessToken)}")
@@ -97,7 +98,8 @@ def render() -> str:
 def _table(model: type[BaseModel]) -> str:
     rows = ["| key | default | meaning |", "| --- | --- | --- |"]
     for name, field in model.model_fields.items():
-        rows.append(f"| `{name}` | {_default(field)} | {field.description or ''} |")
+        meaning = " ".join((field.description or "").split())
+        rows.append(f"| `{name}` | {_default(field)} | {meaning} |")
     return "\n".join(rows) + "\n"
 
 

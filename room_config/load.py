@@ -12,10 +12,11 @@ import tomllib
 from collections.abc import Mapping
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, get_args
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
+from room_config.camera import CameraConfig
 from room_config.exit_codes import BAD_INPUT
 from room_config.imaging import ImagingConfig
 from room_config.listener import ListenerConfig
@@ -36,7 +37,7 @@ class ConfigError(Exception):
 
 
 class Config(BaseModel):
-    """The whole file. `[bridge]`, `[virtual]` and `[camera]` are checked by those who own them."""
+    """The whole file. `[bridge]` and `[virtual]` are checked by those who own them."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -49,7 +50,7 @@ class Config(BaseModel):
     openigtlink: OpenIgtLinkConfig = Field(default_factory=OpenIgtLinkConfig)
     bridge: dict[str, Any] = Field(default_factory=dict)
     virtual: dict[str, Any] = Field(default_factory=dict)
-    camera: dict[str, Any] = Field(default_factory=dict)
+    camera: CameraConfig | None = None
 
 
 def load_config(path: Path, environment: Mapping[str, str] = os.environ) -> Config:
@@ -106,7 +107,9 @@ def _override(table: dict[str, Any], environment: Mapping[str, str]) -> None:
 
 
 def _first_error(error: ValidationError) -> str:
-    first = error.errors()[0]
+    faults = error.errors()
+    # a misspelt key is missing, too
+    first = next((one for one in faults if one["type"] == "extra_forbidden"), faults[0])
     place = [str(part) for part in first["loc"]]
     key = ".".join(place)
     if first["type"] == "extra_forbidden":
@@ -115,16 +118,17 @@ def _first_error(error: ValidationError) -> str:
         return f"unknown key {key}{hint}"
     if first["type"] == "missing":
         return f"missing key {key}"
-    return f"key {key}: {first['msg']}, got {first['input']!r}"
+    got = "" if isinstance(first["input"], dict) else f", got {first['input']!r}"
+    return f"key {key}: {first['msg']}{got}"
 
 
 def _known_keys(place: list[str]) -> list[str]:
     model: Any = Config
     for part in place:
         field = model.model_fields.get(part)
-        if field is None or not isinstance(field.annotation, type):
+        kinds = () if field is None else (field.annotation, *get_args(field.annotation))
+        models = [one for one in kinds if isinstance(one, type) and issubclass(one, BaseModel)]
+        if not models:
             return []
-        if not issubclass(field.annotation, BaseModel):
-            return []
-        model = field.annotation
+        model = models[0]
     return list(model.model_fields)

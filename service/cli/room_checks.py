@@ -5,19 +5,34 @@ from __future__ import annotations
 import ipaddress
 import ssl
 from collections.abc import Iterator
+from pathlib import Path
 
 from dicom_listener.scp import tls_context
-from robot_bridge.daemon.config import BridgeConfig
-from room_config.load import Config
+from robot_bridge.daemon.config import BridgeConfig, bridge_config_from_table
+from robot_bridge.daemon.config import ConfigError as BridgeConfigError
+from room_config.load import Config, ConfigError, load_config
 
 LOOPBACK = ("127.0.0.1", "::1", "localhost")
 _MM = 1000
 
 
-def problems_of(room: Config, bridge: BridgeConfig | None) -> list[str]:
-    """One line each, with the key; none: `up` and `bridge` accept the file."""
+def checked_room(file: Path) -> tuple[Config, BridgeConfig | None]:
+    """A room's file with nothing in it that would be refused later, and its bridge if it has one.
+
+    Raises ConfigError with all that is wrong in one line.
+    """
+    room, bridge = load_config(file), None
+    if room.bridge:
+        try:
+            bridge = bridge_config_from_table(room.bridge, str(file))
+        except BridgeConfigError as error:
+            raise ConfigError(str(error)) from None
     found = [*open_to_others(room), *_networks(room), *_certificates(room), *_waits(room)]
-    return [*found, *(_axes(room, bridge) if bridge is not None else ())]
+    found += _camera(room)
+    found += _axes(room, bridge) if bridge is not None else ()
+    if found:
+        raise ConfigError(f"{file}: {'; '.join(found)}")
+    return room, bridge
 
 
 def open_to_others(room: Config) -> Iterator[str]:
@@ -44,7 +59,8 @@ def _certificates(room: Config) -> Iterator[str]:
                 service.tls_certificate, service.tls_key
             )
         except OSError as error:  # ssl.SSLError is one
-            yield f"service.tls_certificate, service.tls_key: {error}"
+            files = f"{service.tls_certificate}, {service.tls_key}"
+            yield f"service.tls_certificate, service.tls_key: {files}: {error.strerror or error}"
     if listener.tls_certificate and listener.tls_key and listener.tls_authority:
         try:
             tls_context(listener.tls_certificate, listener.tls_key, listener.tls_authority)
@@ -62,6 +78,17 @@ def _waits(room: Config) -> Iterator[str]:
             f"clock uncertainty ({least_s:g} s): no slice could be proved "
             "to belong to its hold"
         )
+
+
+def _camera(room: Config) -> Iterator[str]:
+    """What the listener would do with the slices of a camera, the only ones of a bench."""
+    if room.camera is None:
+        return
+    title, allowed = room.camera.ae_title, room.listener.calling_ae_titles
+    if allowed and title not in allowed:
+        yield f"key listener.calling_ae_titles: the camera's {title!r} (camera.ae_title) is missing"
+    if not room.listener.camera_slices:
+        yield "key listener.camera_slices: must be true, or the camera's slices are set aside"
 
 
 def _axes(room: Config, bridge: BridgeConfig) -> Iterator[str]:

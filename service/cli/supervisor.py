@@ -20,9 +20,9 @@ import typer
 from case_record.cases import Cases
 from case_record.presence import Hanging
 from room_config.exit_codes import BAD_INPUT
-from room_config.load import load_config
 from room_config.shell import announce, autospine, configure_logs, on_parent_gone
 from service.cli.children import ChildError, Family, quiet_environment
+from service.cli.room_checks import checked_room
 
 app = typer.Typer(add_completion=False)
 PROCESSES = ("listener", "worker", "service")
@@ -47,7 +47,7 @@ def up(
     """Run listener, worker and service; one that ends is started again."""
     configure_logs()
     quiet_environment()
-    room = load_config(config)
+    room, _ = checked_room(config)
     stop = threading.Event()
     for number in (signal.SIGINT, signal.SIGTERM):
         signal.signal(number, lambda *_: stop.set())

@@ -1,5 +1,9 @@
 """The whole bench as real processes: camera, listener, worker, service, bridge, emulated motors."""
 
+import contextlib
+import socket
+import subprocess
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -9,7 +13,10 @@ import pytest
 from virtual_bench import BenchDemoRoom, BenchOperator, BenchTruth
 
 from case_record.record import CaseRecord
+from room_config.exit_codes import COULD_NOT
+from room_config.shell import autospine
 from service.client import RoomClient
+from simulator.bench_camera import Scene, VirtualCamera, jpeg
 from simulator.config import parse_virtual_room
 from simulator.demo.room import DemoOptions
 from simulator.truth_client import TruthAddress
@@ -61,6 +68,42 @@ def test_a_case_at_the_bench_comes_to_ready_where_it_says(bench):
         used = [row for row in record.slices() if row.state == "assigned"]
         assert len(used) >= 5
         assert {row.header["kind"] for row in used} == {"camera"}
+
+
+def test_a_stream_that_falls_silent_ends_the_camera_with_one_line(tmp_path):
+    """A driver that waits for the next picture holds nobody up, and nothing is aborted."""
+    held = []
+
+    def serve(listening: socket.socket) -> None:
+        data = jpeg(Scene(VirtualCamera(), 1).picture({"xt": 0.0, "yt": 0.0}), 92)
+        with contextlib.suppress(OSError):
+            while True:
+                sock, _ = listening.accept()
+                held.append(sock)
+                sock.recv(4096)
+                sock.sendall(
+                    b"HTTP/1.0 200 OK\r\n"
+                    b"Content-Type: multipart/x-mixed-replace; boundary=frame\r\n\r\n"
+                )
+                head = f"--frame\r\nContent-Type: image/jpeg\r\nContent-Length: {len(data)}\r\n\r\n"
+                for _ in range(30):
+                    sock.sendall(head.encode() + data + b"\r\n")
+
+    with socket.create_server(("127.0.0.1", 0)) as listening:
+        threading.Thread(target=serve, args=(listening,), daemon=True).start()
+        room = tmp_path / "room.toml"
+        room.write_text(
+            '[room]\nname = "bench"\ncase_dir = "case"\n[service]\nbridge_link = "none"\n'
+            "[camera]\nsensor_px_per_mm = 1.5\n"
+            f'source = "http://127.0.0.1:{listening.getsockname()[1]}/a.mjpg"\n'
+        )
+        done = subprocess.run(
+            autospine("camera", "--config", str(room)), capture_output=True, text=True, timeout=240
+        )
+    assert done.returncode == COULD_NOT, done.stderr
+    assert done.stderr.strip().splitlines()[-1].startswith("autospine: camera http://127.0.0.1:")
+    assert "Aborted" not in done.stderr
+    assert "terminate" not in done.stderr
 
 
 @pytest.mark.soak

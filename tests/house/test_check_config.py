@@ -15,6 +15,18 @@ def checked(path: Path) -> subprocess.CompletedProcess[str]:
     return subprocess.run(words, capture_output=True, text=True, check=False)
 
 
+def assert_refused(path: Path, *words: str) -> None:
+    """In one line and with one code, whoever is asked."""
+    done = checked(path)
+    assert done.returncode == 2, done.stdout + done.stderr
+    assert len(done.stderr.strip().splitlines()) == 1
+    assert all(word in done.stderr for word in words), done.stderr
+    started = subprocess.run(
+        autospine("up", "--config", str(path)), capture_output=True, text=True, timeout=120
+    )
+    assert (started.returncode, started.stderr) == (2, done.stderr)
+
+
 def test_the_example_is_accepted():
     done = checked(EXAMPLE)
     assert done.returncode == 0, done.stderr
@@ -48,7 +60,17 @@ def test_what_would_be_refused_at_the_start_is_one_line_and_code_2(tmp_path, sec
             kept.append(line)
     path = tmp_path / "room.toml"
     path.write_text("\n".join(kept))
-    done = checked(path)
-    assert done.returncode == 2, done.stdout + done.stderr
-    assert len(done.stderr.strip().splitlines()) == 1
-    assert all(word in done.stderr for word in words), done.stderr
+    assert_refused(path, *words)
+
+
+@pytest.mark.parametrize(
+    ("table", "words"),
+    [
+        ("foo = 3", ("camera.foo",)),
+        ("", ("calling_ae_titles", "'BENCHCAMERA'", "listener.camera_slices")),
+    ],
+)
+def test_a_camera_that_would_not_be_heard_is_named(tmp_path, table, words):
+    path = tmp_path / "room.toml"
+    path.write_text(f'{EXAMPLE.read_text()}\n[camera]\nsource = "0"\n{table}\n')
+    assert_refused(path, *words)
