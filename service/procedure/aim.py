@@ -34,8 +34,9 @@ class ApproachArguments:
     paper's studies). seed: of the random shift sets. most_frames: slices at one position at the
     most. proven: what is measured was seen to move with the robot, see `identity`; otherwise READY
     is said only after a move that shows it. systematic_mm: std, for each coordinate, of what all
-    places found so have in common, where it counts: see `targets.common_part_mm`. lower_plane_mm:
-    of the guide's lower ball joints along the slice normal.
+    places found so have in common, where it counts: see `targets.common_part_mm`. common_cancels:
+    what draws the centre of a disc drew the target's alike, so that of it only what differs from
+    look to look is left. lower_plane_mm: of the guide's lower ball joints along the slice normal.
     """
 
     target_mm: tuple[float, ...]
@@ -48,6 +49,7 @@ class ApproachArguments:
     proven: bool = True
     most_frames: int = 6
     systematic_mm: tuple[float, ...] = ()
+    common_cancels: bool = False
     strategy: str | Strategy = "adaptive"
     stop_rule: str = PROBABILITY
     seed: int = 0

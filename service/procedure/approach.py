@@ -195,7 +195,7 @@ def _look(
     )
     if here.seen.after_loss:
         there = replace(there, proven=False)
-    return _believing(there, here, fuses=arguments.how_to_look.fuses)
+    return _believing(arguments, there, here, fuses=arguments.how_to_look.fuses)
 
 
 def _look_longer(arguments: ApproachArguments, standing: Standing) -> ProcedureSteps[Standing]:
@@ -214,14 +214,18 @@ def _look_longer(arguments: ApproachArguments, standing: Standing) -> ProcedureS
         frames=standing.frames + more.seen.frames - before.seen.frames,
         scan_s=standing.scan_s + more.seen.scan_s - before.seen.scan_s,
     )
-    return _believing(there, more, fuses=True)
+    return _believing(arguments, there, more, fuses=True)
 
 
-def _believing(standing: Standing, here: Observation, *, fuses: bool) -> Standing:
+def _believing(
+    arguments: ApproachArguments, standing: Standing, here: Observation, *, fuses: bool
+) -> Standing:
     """What is believed after a look: it alone, or with all that was believed before it."""
-    estimate = here.found
+    estimate, prior = here.found, here.prior
+    if arguments.common_cancels:
+        estimate, prior = (replace(one, common_mm=None) for one in (estimate, prior))
     if fuses:
-        estimate = here.prior.fused_with(estimate)
+        estimate = prior.fused_with(estimate)
     calibration = replace(
         standing.calibration, estimate=estimate, measurement_id=here.seen.measurement_id
     )

@@ -24,6 +24,7 @@ from service.procedure.recording import RecordingArguments
 from service.procedure.targets import (
     Target,
     TargetError,
+    common_cancels,
     common_part_mm,
     fiducial_must_appear_at,
     needle_line,
@@ -119,6 +120,7 @@ def approach_of(
         proven=proven,
         most_frames=service.most_slices,
         systematic_mm=common_part_mm(target, start),
+        common_cancels=common_cancels(target, start),
         geometry=geometry,
         lower_plane_mm=guide.lower_plane_mm if guide else 0.0,
     )

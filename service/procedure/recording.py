@@ -101,7 +101,9 @@ def record_place(arguments: RecordingArguments, start: Calibration) -> Procedure
         wanted = _slices_for(arguments, here)
         if wanted > here.seen.frames_of_each:
             here = yield from look_longer(here, geometry, gate, frames=wanted)
-        estimate = here.prior.fused_with(here.found)
+        # what draws a disc's centre draws it alike where this target is approached
+        prior, found = (replace(one, common_mm=None) for one in (here.prior, here.found))
+        estimate = prior.fused_with(found)
     return _place(arguments, start, estimate, here)
 
 

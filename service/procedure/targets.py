@@ -105,6 +105,12 @@ def target_of(event: Event) -> Target:
     )
 
 
+def common_cancels(target: Target, start: Calibration) -> bool:
+    """Whether a target is the fiducial's own place, or relative to it, found as it is found now."""
+    then = target.found_by
+    return not target.in_water and (then is None or then.templates == start.found_by.templates)
+
+
 def common_part_mm(target: Target, start: Calibration) -> tuple[float, ...]:
     """Std, for each coordinate, of what all places found as now have in common and counts here.
 
@@ -115,7 +121,7 @@ def common_part_mm(target: Target, start: Calibration) -> tuple[float, ...]:
     then, now = target.found_by, start.found_by
     if target.in_water:
         return now.systematic_mm
-    if then is None or then.templates == now.templates:
+    if then is None or common_cancels(target, start):
         return ()
     if not then.templates or not now.templates:
         return now.systematic_mm or then.systematic_mm

@@ -10,7 +10,7 @@ from service.procedure.approach import approach
 from service.procedure.calibration import calibrate
 from service.procedure.estimate import FiducialEstimate
 from service.procedure.observe import CONFIRM, REJECT, ProcedureFailedError
-from service.procedure.steps import AskOperator, MoveTo
+from service.procedure.steps import AskOperator, Measured, MoveTo
 from simulator.config import Placement, StaticObject, VirtualRoom
 from simulator.stage_physics import StageParameters
 from studies.offline_room import MrImaging, OfflineRoom
@@ -95,6 +95,41 @@ def test_where_it_already_stands_it_looks_once_before_it_says_ready(calibrated):
     assert room.frames > frames
     assert arrival.iterations == 0
     assert len(room.moves) == moves
+
+
+@pytest.mark.parametrize("cancels", [True, False])
+def test_what_draws_a_disc_averages_out_only_where_it_drew_the_target_alike(calibrated, cancels):
+    """READY at the fiducial's own place; in tissue no number of looks makes it sure."""
+    room, calibration = calibrated
+    drawn_mm = 0.04
+    target = calibration.estimate.plane_mm
+
+    def run():
+        step = next(steps)
+        while True:
+            outcome = room.execute(step)
+            if isinstance(outcome, Measured):
+                wider = np.array(outcome.covariance_mm2) + np.eye(2) * drawn_mm**2
+                (a, b), (c, d) = wider.tolist()
+                outcome = replace(
+                    outcome, covariance_mm2=((a, b), (c, d)), common_mm=(drawn_mm, drawn_mm)
+                )
+            try:
+                step = steps.send(outcome)
+            except StopIteration as finished:
+                return finished.value
+
+    unsure = replace(calibration.estimate, covariance_mm2=np.eye(2))
+    steps = approach(
+        approach_arguments(target, common_cancels=cancels), replace(calibration, estimate=unsure)
+    )
+    if cancels:
+        assert run().probability >= 0.95
+    else:
+        with pytest.raises(
+            ProcedureFailedError, match=r"not reached in 8 moves: .* P\(error < 0.06"
+        ):
+            run()
 
 
 def test_every_move_waits_for_confirmation_and_a_rejection_holds_it(make_room, calibrated):

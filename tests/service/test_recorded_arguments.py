@@ -48,7 +48,7 @@ CALIBRATED = {"axes", "origin_um", "move_um", "shifts_px", "method", "last", "sa
 }
 APPROACHED = {"target_mm", "travel_um", "tolerance_mm", "confidence", "max_iterations"} | {
     *("confirm_moves", "most_frames", "proven", "strategy", "stop_rule", "seed"),
-    *("systematic_mm", "geometry", "lower_plane_mm"),
+    *("systematic_mm", "common_cancels", "geometry", "lower_plane_mm"),
 }
 OTHERS = {
     CALIBRATION: CALIBRATED,
@@ -59,7 +59,7 @@ OTHERS = {
 # what a program before did not write
 ADDED = {
     CALIBRATION: {"geometry"},
-    APPROACH: {"geometry", "lower_plane_mm"},
+    APPROACH: {"geometry", "lower_plane_mm", "common_cancels"},
     GUIDE_CALIBRATION: {"shifts_px", "method"},
     GUIDE_APPROACH: {"strategy", "stop_rule", "seed"},
 }

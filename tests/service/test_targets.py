@@ -1,5 +1,7 @@
 """Targets: set, replaced, withdrawn; the oil-water shift against slices that really have it."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from offline_arguments import approach_arguments, calibration_arguments
@@ -9,11 +11,14 @@ from test_guide import calibration_arguments as guide_calibration
 
 from case_record.record import CaseRecord
 from service.procedure.approach import approach
-from service.procedure.calibration import calibrate
+from service.procedure.calibration import BY_DISC, Calibration, FoundBy, calibrate
+from service.procedure.estimate import FiducialEstimate
+from service.procedure.jacobian import ImageJacobian
 from service.procedure.targets import (
     Target,
     TargetError,
     all_targets,
+    common_cancels,
     current_target,
     fiducial_must_appear_at,
     needle_line,
@@ -142,3 +147,16 @@ def test_the_plane_of_the_room_is_coronal():
     from simulator.mr_slice import slice_geometry
 
     assert plane_of(slice_geometry(VirtualRoom().protocol)) == PLANE
+
+
+def test_what_draws_a_disc_cancels_only_between_places_found_alike():
+    """Not for a place in tissue, nor for one that was found by a template."""
+    by_template = FoundBy(((1, 2),), (0.01, 0.01), (0.0, 0.0))
+    seen = FiducialEstimate({"xt": 0, "yt": 0}, np.zeros(2), np.eye(2))
+    now = Calibration(ImageJacobian.unknown(("xt", "yt")), seen, PLANE, 7)
+    here = Target(1, (0.0, 0.0, 0.0), found_by=BY_DISC)
+    assert common_cancels(here, now)
+    assert common_cancels(replace(here, found_by=None), now)
+    assert not common_cancels(replace(here, in_water=True), now)
+    assert not common_cancels(replace(here, found_by=by_template), now)
+    assert not common_cancels(here, replace(now, found_by=by_template))
