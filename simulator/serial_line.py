@@ -275,9 +275,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         return 2
     if args.exit_with_parent:
         threading.Thread(target=_end_with_parent, daemon=True).start()
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    print(json.dumps({"ready": True, "near": str(args.near), "far": str(args.far)}), flush=True)
     with contextlib.closing(modem), contextlib.suppress(KeyboardInterrupt):
+        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        print(json.dumps({"ready": True, "near": str(args.near), "far": str(args.far)}), flush=True)
         modem.serve()
     return 0
 
