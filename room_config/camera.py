@@ -4,10 +4,7 @@ from typing import Annotated, Literal
 
 from pydantic import ConfigDict, Field
 
-from room_config.section import Section
-
-Positive = Annotated[float, Field(gt=0)]
-AeTitle = Annotated[str, Field(min_length=1, max_length=16, pattern=r"^[\x21-\x5b\x5d-\x7e]+$")]
+from room_config.section import AeTitle, Positive, Section
 
 
 class CameraConfig(Section):

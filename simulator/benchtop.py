@@ -19,12 +19,13 @@ from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 from scipy.ndimage import correlate
 
+from room_config.section import Positive
 from sr_engine.psf import Psf
 from sr_engine.simulate import render_disc
 
 Floats = NDArray[np.float64]
 Bytes = NDArray[np.uint8]
-Positive = Annotated[float, Field(gt=0)]
+
 Share = Annotated[float, Field(ge=0, le=1)]
 Colour = tuple[Share, Share, Share]
 Size = Annotated[int, Field(ge=16, le=4096)]

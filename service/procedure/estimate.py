@@ -78,16 +78,17 @@ class FiducialEstimate:
     def fused_with(self, found: FiducialEstimate) -> FiducialEstimate:
         """Combine the prediction with what was found at the same setpoints.
 
-        What both have in common is no second witness: they are weighed by the rest, and it stays.
+        What both have in common is no second witness: they are weighed by the rest, and it stays. A
+        prediction that does not say what draws it is drawn as the look is: it is of one object.
         """
-        common = [
-            np.zeros(len(x.plane_mm)) if x.common_mm is None else x.common_mm for x in (self, found)
-        ]
-        shared = np.diag(np.square(np.minimum(*common)))
-        own, its = self.covariance_mm2 - shared, found.covariance_mm2 - shared
+        its_mm = np.zeros(len(self.plane_mm)) if found.common_mm is None else found.common_mm
+        own_mm = its_mm if self.common_mm is None else self.common_mm
+        shared = np.diag(np.square(np.minimum(own_mm, its_mm)))
+        own = self.noise_mm2 + np.diag(np.square(own_mm)) - shared
+        its = found.covariance_mm2 - shared
         gain = np.linalg.solve(own + its, own).T
         rest = np.eye(len(gain)) - gain
-        common_mm = np.abs(rest) @ common[0] + np.abs(gain) @ common[1]
+        common_mm = np.abs(rest) @ own_mm + np.abs(gain) @ its_mm
         noise_mm2 = rest @ self.noise_mm2 @ rest.T + gain @ found.noise_mm2 @ gain.T
         return FiducialEstimate(
             self.setpoints_um,

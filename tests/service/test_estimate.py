@@ -1,5 +1,7 @@
 """Estimates: fusion, prediction, and how sure is sure enough."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -78,6 +80,9 @@ def test_what_all_looks_have_in_common_is_not_averaged_out(row, col, noise, comm
     information = sum(spread**-2 for spread in noise)
     expected = 1 / information + common**2
     assert np.diag(fused.covariance_mm2) == pytest.approx([expected] * 2, rel=1e-6)
+    # after an approach to the fiducial's own place it is not said any more, but still there
+    unsaid = replace(fused, covariance_mm2=fused.noise_mm2, common_mm=None)
+    assert unsaid.fused_with(looks[0]).covariance_mm2[0, 0] >= common**2 * (1 - 1e-9)
     assert fused.with_noise_times(0).covariance_mm2 == pytest.approx(np.eye(2) * common**2)
     # what is drawn further aside than the rest tells little, and the estimate stays sound
     other = FiducialEstimate(HERE, np.zeros(2), np.eye(2), np.full(2, 0.9))
